@@ -1,0 +1,713 @@
+"""A forestry crane that grasps and lifts a log: MuJoCo simulator and Gymnasium environment.
+
+    import gymnasium, crane_env
+    env = gymnasium.make("ForestryCrane-v0")                   # one crane, `CraneEnv`
+    envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=64)  # many at once, `CraneVectorEnv`
+
+The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
+stages), and its grapple hangs from two passive joints q5, q6 below a rotator q7 and two jaws q8.
+Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
+Crane: Simulator and Benchmarking". Sources of all numbers: assets/README.md.
+
+Observation, float32, `Box` of shape (18,):
+
+| index | meaning                                          | unit  | low     | high   |
+|-------|--------------------------------------------------|-------|---------|--------|
+| 0     | q1 slew angle                                    | rad   | -4.21   | 4.21   |
+| 1     | q2 boom angle, positive lifts                    | rad   | -1.7    | 2.063  |
+| 2     | q3 arm angle, 0 square to the boom               | rad   | -1.41   | 2.0    |
+| 3     | q4 length of each telescope stage                | m     | -0.5    | 2.736  |
+| 4     | q5 passive tip angle, hangs at pi/2 - q2 - q3    | rad   | -2.0708 | 2.0708 |
+| 5     | q6 passive tilt angle, hangs at pi/2             | rad   | 0.2854  | 2.8562 |
+| 6     | q7 rotator angle                                 | rad   | -3.6416 | 3.6416 |
+| 7     | q8 jaw angle, 0 open                             | rad   | -0.5    | 3.5    |
+| 8     | q1 velocity                                      | rad/s | -10     | 10     |
+| 9     | q2 velocity                                      | rad/s | -10     | 10     |
+| 10    | q3 velocity                                      | rad/s | -10     | 10     |
+| 11    | q4 velocity of each stage                        | m/s   | -10     | 10     |
+| 12    | q7 velocity                                      | rad/s | -10     | 10     |
+| 13    | q8 velocity                                      | rad/s | -10     | 10     |
+| 14    | Delta_p,x from grapple centre to log, world axes | m     | -20     | 20     |
+| 15    | Delta_p,y                                        | m     | -20     | 20     |
+| 16    | Delta_p,z, with the paper's offset               | m     | -20     | 20     |
+| 17    | Delta_psi, 0 aligned (signed_yaw: angle in rad)  | 1     | -1.5708 | 1.5708 |
+
+Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
+direction. 0 stops the joint; values outside the box are clipped.
+
+| index | meaning          | unit | low | high | speed "real" at -1, +1    | speed "mjcf"  |
+|-------|------------------|------|-----|------|---------------------------|---------------|
+| 0     | q1 slew          | 1    | -1  | 1    | -0.764, 0.802 rad/s       | -1.57, 1.57   |
+| 1     | q2 boom          | 1    | -1  | 1    | -0.326, 0.239 rad/s       | -1.57, 1.57   |
+| 2     | q3 arm           | 1    | -1  | 1    | -0.344, 0.326 rad/s       | -1.57, 1.57   |
+| 3     | q4 each stage    | 1    | -1  | 1    | -0.630, 0.400 m/s         | -2, 2         |
+| 4     | q7 rotator       | 1    | -1  | 1    | -2.12, 2.12 rad/s         | -3, 3         |
+| 5     | q8 jaws          | 1    | -1  | 1    | -1.8, 1.8 rad/s           | -3, 3         |
+"""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple, Sequence
+
+if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before mujoco is imported
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from mujoco.batch import Batch, SimulationError
+
+MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
+TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
+LOG_LENGTH = 2.75  # m
+LOG_DENSITY = 650.0  # kg/m^3
+D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
+POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
+POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
+TIME_LIMIT = 9.0  # s
+REACH_TIME = 6.0  # s
+REACH_DISTANCE = 0.35  # m, bound of d_combine
+LOG_RANGE = 8.0  # m, between grapple centre and log centre
+Q8_MAX = 3.0  # rad
+DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
+HOLD_TIME = 0.5  # s at the end of the episode
+MIN_CLEARANCE = 0.1  # m below the log's lowest point
+MAX_MISS = 0.3  # m along the log
+
+SPEEDS = {  # limits of (q1, q2, q3, q4, q7, q8): rad/s, m/s per stage
+    "real": (
+        np.array([-0.764, -0.326, -0.344, -0.630, -2.12, -1.8]),
+        np.array([0.802, 0.239, 0.326, 0.400, 2.12, 1.8]),
+    ),
+    "mjcf": (
+        -np.array([1.57, 1.57, 1.57, 2.0, 3.0, 3.0]),
+        np.array([1.57, 1.57, 1.57, 2.0, 3.0, 3.0]),
+    ),
+}
+JOINTS = ["q1", "q2", "q3", "q4", "q5", "q6", "q7", "q8"]
+SERVOS = ["q1", "q2", "q3", "q4", "q4_stage2", "q7", "q8", "q8_inner"]
+COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
+ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
+LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
+TERMINATIONS = np.array(
+    [
+        "none",
+        "not_reached",
+        "joint_limit",
+        "log_too_far",
+        "overspeed",
+        "diverged",
+        "time_limit",
+    ]
+)
+INTEGRATORS = ("discrete", "implicitfast", "implicit", "Euler")
+SOLVERS = ("Newton", "CG")
+
+
+class CraneState(NamedTuple):
+    """What observation, reward and rules are computed from, for N cranes."""
+
+    q: np.ndarray  # (N, 8) joint positions, rad and m
+    dq: np.ndarray  # (N, 6) velocities of the actuated joints
+    grapple_centre: np.ndarray  # (N, 3) p_C, m
+    grapple_axis: np.ndarray  # (N, 3) e_C,x, unit
+    log_centre: np.ndarray  # (N, 3) p_l, m
+    log_axis: np.ndarray  # (N, 3) along the log, unit
+    touching: np.ndarray  # (N, 2) bool, outer and inner jaw on the log
+    diameter: np.ndarray  # (N,) m
+
+
+def _choice(name: str, value: Any, allowed: Sequence) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+
+
+def load_model(
+    contact: str = "primitive",
+    integrator: str = "implicitfast",
+    solver: str = "Newton",
+    sdf_initpoints: int = 8,
+    sdf_iterations: int = 5,
+) -> mujoco.MjModel:
+    """Compile assets/crane.xml.
+
+    contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the jaws'
+    meshes as signed distance fields against the log's cylinder (paper, Sec. III-B); the two numbers
+    are MuJoCo's starting points and gradient steps of the search for contacts (its defaults: 40, 10).
+    """
+    _choice("contact", contact, ("primitive", "sdf"))
+    _choice("integrator", integrator, INTEGRATORS)
+    _choice("solver", solver, SOLVERS)
+    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
+    spec.option.sdf_initpoints = sdf_initpoints
+    spec.option.sdf_iterations = sdf_iterations
+    if contact == "sdf":
+        log_bit = spec.geom("log_capsule").contype
+        for geom in spec.geoms:
+            if geom.classname.name == "jaw_collision":
+                geom.conaffinity &= ~log_bit
+            elif geom.classname.name == "jaw_mesh":
+                geom.type = mujoco.mjtGeom.mjGEOM_SDF
+                geom.conaffinity = log_bit
+        spec.geom("log").contype, spec.geom("log_capsule").contype = log_bit, 0
+    return spec.compile()
+
+
+def tip_position(q2: np.ndarray, q3: np.ndarray, q4: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of the tip joint from the slew axis and its height, both in m (DH parameters)."""
+    arm = 3.157 + 2 * q4
+    out = -0.18 + 3.49288 * np.cos(q2) - 0.3925 * np.cos(q2 + q3) + arm * np.sin(q2 + q3)
+    up = 3.5657 + 3.49288 * np.sin(q2) - 0.3925 * np.sin(q2 + q3) - arm * np.cos(q2 + q3)
+    return out, up
+
+
+def sample_start(
+    rng: np.random.Generator, difficulty: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Draw one start: q (8,), log pose (x, y, yaw) in m and rad, log diameter in m.
+
+    difficulty 1 is the full task. Smaller values draw the same start and then move the log towards a
+    point under the grapple, its yaw towards the grapple's and its diameter towards the mean one.
+    """
+    while True:
+        candidates = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3))
+        q2, q3, q4 = candidates.T
+        out, up = tip_position(q2, q3, q4)
+        good = (4.5 <= out) & (out <= 8) & (2.7 <= up) & (up <= 4.2) & (q2 + q3 > 0.05)
+        if good.any():
+            break
+    first = np.argmax(good)
+    (q2, q3, q4), out = candidates[first], out[first]
+    q1, azimuth = rng.uniform(-2 * np.pi / 3, -np.pi / 3, size=2)
+    swing5, swing6 = rng.uniform(-0.05, 0.05, size=2)
+    q7, yaw = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
+    q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
+    q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
+
+    easy_radius, easy_yaw = np.clip(out, 5.5, 7.5), q1 - q7
+    radius = easy_radius + difficulty * (radius - easy_radius)
+    azimuth = q1 + difficulty * (azimuth - q1)
+    turn = (yaw - easy_yaw + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
+    yaw = (easy_yaw + difficulty * turn + np.pi / 2) % np.pi - np.pi / 2
+    mean_diameter = (D_MIN + D_MAX) / 2
+    diameter = mean_diameter + difficulty * (diameter - mean_diameter)
+    return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
+
+
+def relative_pose(
+    state: CraneState, offset: str = "minus", signed_yaw: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], and what is observed of the angle, (N,).
+
+    Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the log's
+    diameter d; see the errata in the README. offset "plus" adds it instead. The last value is
+    Delta_psi, or with signed_yaw the signed angle from grapple to log in rad, in [-pi/2, pi/2).
+    """
+    sign = 1.0 if offset == "plus" else -1.0
+    delta_p = state.log_centre - state.grapple_centre
+    delta_p[:, 2] += sign * (D_MAX - state.diameter) / 2
+    log_xy = state.log_axis[:, :2]
+    log_xy = log_xy / np.maximum(np.linalg.norm(log_xy, axis=-1, keepdims=True), 1e-9)
+    dot = np.sum(state.grapple_axis[:, :2] * log_xy, axis=-1)
+    delta_psi = 1.0 - np.minimum(np.abs(dot), 1.0)
+    if not signed_yaw:
+        return delta_p, delta_psi, delta_psi
+    cross = state.grapple_axis[:, 0] * log_xy[:, 1] - state.grapple_axis[:, 1] * log_xy[:, 0]
+    angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
+    return delta_p, delta_psi, angle
+
+
+def noisy_pose(
+    delta_p: np.ndarray, angle: np.ndarray, epsilon: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pose measurement errors of Sec. IV-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
+    decay = np.sum(delta_p**2, axis=-1) / POSE_RANGE**2  # s(Delta_p)
+    noisy_delta_p = delta_p * (1 + epsilon[:, :1] * decay[:, None])
+    return noisy_delta_p, angle * (1 + epsilon[:, 1] * decay)
+
+
+def log_clearance(state: CraneState) -> np.ndarray:
+    """Height of the lowest point of the log above the ground, (N,) in m."""
+    up = np.minimum(np.abs(state.log_axis[:, 2]), 1.0)
+    below_centre = LOG_LENGTH / 2 * up + state.diameter / 2 * np.sqrt(1 - up**2)
+    return state.log_centre[:, 2] - below_centre
+
+
+def centre_miss(state: CraneState) -> np.ndarray:
+    """Distance from the log's centre to p_C, measured along the log, (N,) in m."""
+    return np.abs(np.sum((state.grapple_centre - state.log_centre) * state.log_axis, axis=-1))
+
+
+def reward_terms(
+    state: CraneState,
+    d_combine: np.ndarray,
+    command: np.ndarray,
+    kind: str = "staged",
+    omega2: float = 1.0,
+    omega3: float = 1.0,
+) -> np.ndarray:
+    """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
+
+    d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities in
+    rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one before
+    it, and its r_lift counts twice. Why: README, errata.
+    """
+    r_distance = np.exp(-omega2 * d_combine)
+    closed = state.q[:, 7] / Q8_MAX
+    calm = 1 - np.tanh(np.linalg.norm(command, axis=-1))
+    if kind == "paper":
+        r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
+        height_error = np.abs(state.log_centre[:, 2] - DESIRED_HEIGHT)
+        r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
+        r_balance = calm * (1 - r_lift)
+    else:
+        r_grapple = r_distance * closed
+        lift = r_distance * np.clip(log_clearance(state), 0, 1)
+        r_lift, r_balance = 2 * lift, calm * lift
+    return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
+
+
+def termination_rule(
+    state: CraneState,
+    time: np.ndarray,
+    reached: np.ndarray,
+    diverged: np.ndarray,
+    joint_range: np.ndarray,
+    speed: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Index into TERMINATIONS of the rule that ends each episode, 0 where it goes on, (N,).
+
+    time (N,) in s since the start, reached (N,) bool, joint_range (8, 2), speed as in SPEEDS.
+    """
+    q, (low, high) = state.q[:, LIMITED], joint_range[LIMITED].T
+    distance = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
+    rules = {
+        "diverged": diverged,
+        "joint_limit": ((q < low) | (q > high)).any(axis=-1),
+        "overspeed": ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
+        "log_too_far": distance > LOG_RANGE,
+        "not_reached": ~reached & (time > REACH_TIME - 1e-9),
+        "time_limit": time > TIME_LIMIT - 1e-9,
+    }
+    codes = [np.flatnonzero(TERMINATIONS == name)[0] for name in rules]
+    return np.select(list(rules.values()), codes, default=0)
+
+
+def success_conditions(
+    reached: np.ndarray, clearance: np.ndarray, touching: np.ndarray, miss: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The one definition of success, for training, evaluation and tests: (N,) bool each.
+
+    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. The others hold the decisions
+    of the last HOLD_TIME of an episode that lasted TIME_LIMIT: clearance (N, W) and miss (N, W) in m,
+    touching (N, W, 2).
+    """
+    failed = {
+        "not_reached": ~reached,
+        "not_lifted": (clearance < MIN_CLEARANCE).any(axis=-1),
+        "not_held": ~touching.all(axis=(-2, -1)),
+        "off_centre": (miss > MAX_MISS).any(axis=-1),
+    }
+    return {"success": ~np.any(list(failed.values()), axis=0), **failed}
+
+
+def monte_carlo_trials(
+    seed: int, trials: int, diameters: Sequence[float] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+) -> tuple[np.ndarray, list[np.random.SeedSequence]]:
+    """Diameters (m) and seeds of trials per diameter, for `CraneVectorEnv` and its `reset`.
+
+    Trial k at a diameter is the same whatever the number of trials and the other diameters.
+    """
+    seeds = [
+        np.random.SeedSequence(seed, spawn_key=(round(1000 * d), k))
+        for d in diameters
+        for k in range(trials)
+    ]
+    return np.repeat(diameters, trials), seeds
+
+
+class CraneVectorEnv(gymnasium.vector.VectorEnv):
+    """N cranes stepped together on one `mujoco.batch.Batch`; SAME_STEP autoreset.
+
+    num_envs: N. env_threads: physics threads, 0 for all cores. frame_skip: physics steps of 5 ms per
+    decision, 20 is 10 Hz, 1 the paper's protocol. speed: command limits, a key of SPEEDS.
+    reward: "staged" or "paper", with omega1 (m), omega2 (1/m), omega3 (1/m).
+    offset, signed_yaw: see `relative_pose`. pose_noise: "none", "step" (drawn at every decision) or
+    "episode" (drawn once); it touches the observation only.
+    diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`; may
+    be assigned at any time and holds from the next start on.
+    contact, integrator, solver, sdf_initpoints, sdf_iterations: see `load_model`.
+
+    Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
+
+    `info` describes the step just made, for every crane, also one that ended with it: `termination`
+    (a name of TERMINATIONS), the terms r_distance, r_grapple, r_lift, r_balance, `d_combine`,
+    `clearance`, `centre_miss` (m), `time_to_reach` (s, nan before), and, meaningful where an episode
+    ended, `success` and its failed conditions `not_reached`, `not_lifted`, `not_held`, `off_centre`.
+    Where episodes ended, `final_obs` and `final_info` hold their end under the masks `_final_obs` and
+    `_final_info`.
+    """
+
+    metadata = {
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        frame_skip: int = 20,
+        contact: str = "primitive",
+        reward: str = "staged",
+        speed: str = "real",
+        offset: str = "minus",
+        signed_yaw: bool = False,
+        pose_noise: str = "none",
+        diameter: float | np.ndarray | None = None,
+        difficulty: float = 1.0,
+        omega1: float = 1.0,
+        omega2: float = 1.0,
+        omega3: float = 1.0,
+        integrator: str = "implicitfast",
+        solver: str = "Newton",
+        sdf_initpoints: int = 8,
+        sdf_iterations: int = 5,
+        env_threads: int = 0,
+        render_mode: str | None = None,
+        camera: str = "overview",
+        width: int = 640,
+        height: int = 480,
+    ):
+        for name, value in {"num_envs": num_envs, "frame_skip": frame_skip}.items():
+            if int(value) != value or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value}")
+        _choice("reward", reward, ("staged", "paper"))
+        _choice("speed", speed, tuple(SPEEDS))
+        _choice("offset", offset, ("minus", "plus"))
+        _choice("pose_noise", pose_noise, ("none", "step", "episode"))
+        _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        self.num_envs, self.frame_skip = int(num_envs), int(frame_skip)
+        self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
+        self.speed, self.pose_noise = SPEEDS[speed], pose_noise
+        self.omega1, self.omega2, self.omega3 = omega1, omega2, omega3
+        self.difficulty = difficulty
+        self.fixed_diameter = None
+        if diameter is not None:
+            self.fixed_diameter = np.broadcast_to(np.asarray(diameter, float), (num_envs,))
+            if not np.all((D_MIN <= self.fixed_diameter) & (self.fixed_diameter <= D_MAX)):
+                raise ValueError(f"diameter must lie in [{D_MIN}, {D_MAX}] m, got {diameter}")
+
+        self.model = load_model(contact, integrator, solver, sdf_initpoints, sdf_iterations)
+        self.batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
+        self._bind(self.batch, self.model)
+        self.dt = self.frame_skip * TIMESTEP
+        self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
+        window = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
+        self._diameter = np.full(self.num_envs, (D_MIN + D_MAX) / 2)
+        self._decisions = np.zeros(self.num_envs, int)
+        self._reach_time = np.full(self.num_envs, np.nan)
+        self._last_clearance = np.zeros((self.num_envs, window))
+        self._last_miss = np.zeros((self.num_envs, window))
+        self._last_touching = np.zeros((self.num_envs, window, 2), bool)
+        self._noise = np.zeros((self.num_envs, self.max_decisions + 1, 2))
+        self._rngs: list[tuple[np.random.Generator, np.random.Generator]] | None = None
+
+        low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
+        bound = np.concatenate([np.full(6, 10.0), np.full(3, 20.0), [np.pi / 2]])
+        self.single_observation_space = gymnasium.spaces.Box(
+            np.concatenate([low, -bound]).astype(np.float32),
+            np.concatenate([high, bound]).astype(np.float32),
+        )
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+        self.render_mode, self.camera = render_mode, camera
+        self._frame_size = (height, width)
+        self._renderer = self._viewer = self._scene_model = self._scene_data = None
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
+
+    def _bind(self, batch: Batch, model: mujoco.MjModel) -> None:
+        """Live views of the engine's arrays, and where in them our joints are."""
+        self._qpos, self._qvel, self._act = (batch.bind(n) for n in ("qpos", "qvel", "act"))
+        self._ctrl, self._sensordata = batch.bind("ctrl"), batch.bind("sensordata")
+        self._qfrc_bias = batch.bind("qfrc_bias")
+        self._log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
+        self._log_body = model.body("log").id
+        self._log_qpos = slice(model.joint("log").qposadr[0], model.joint("log").qposadr[0] + 7)
+        self._geom_size = batch.expand("geom_size")
+        self._body_mass = batch.expand("body_mass")
+        self._body_inertia = batch.expand("body_inertia")
+        joints = [model.joint(name) for name in JOINTS]
+        servos = [model.joint(name) for name in SERVOS]
+        self._q = np.array([j.qposadr[0] for j in joints])
+        self._dq = np.array([joints[i].dofadr[0] for i in ACTUATED])
+        self._servo_q = np.array([j.qposadr[0] for j in servos])
+        self._servo_dq = np.array([j.dofadr[0] for j in servos])
+        self.joint_range = np.array([j.range for j in joints])  # (8, 2), rad and m
+        integral = [model.actuator(f"{name}_integral") for name in SERVOS]
+        self._servo_kp = np.array([a.gainprm[0] for a in integral])
+        force_limit = model.jnt_actfrcrange[[j.id for j in servos], 1]  # N m, telescopes N
+        self._max_lead = force_limit / self._servo_kp
+
+    @property
+    def difficulty(self) -> float:
+        return self._difficulty
+
+    @difficulty.setter
+    def difficulty(self, value: float) -> None:
+        if not 0 <= value <= 1:
+            raise ValueError(f"difficulty must lie in [0, 1], got {value}")
+        self._difficulty = float(value)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | np.random.SeedSequence] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start a new episode in every crane.
+
+        seed: one for all (crane i then draws from its i-th child), or one per crane.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        if seed is not None or self._rngs is None:
+            if seed is None or isinstance(seed, (int, np.integer)):
+                seeds = np.random.SeedSequence(seed).spawn(self.num_envs)
+            elif len(seed) != self.num_envs:
+                raise ValueError(f"{len(seed)} seeds for {self.num_envs} cranes")
+            else:
+                seeds = [np.random.SeedSequence(s) if isinstance(s, int) else s for s in seed]
+            # Two streams, so that pose noise leaves the starts as they are.
+            self._rngs = [
+                tuple(np.random.default_rng(np.random.SeedSequence(s.entropy, spawn_key=(*s.spawn_key, k))) for k in (0, 1))
+                for s in seeds
+            ]
+        self._start_episodes(np.arange(self.num_envs))
+        state = self._state()
+        return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance every crane by one decision of actions (N, 6); start anew where an episode ends."""
+        obs, reward, terminated, truncated, info = self.advance(actions)
+        done = terminated | truncated
+        if done.any():
+            ended = np.flatnonzero(done)
+            info["final_obs"] = np.full(self.num_envs, None, dtype=object)
+            for i in ended:
+                info["final_obs"][i] = obs[i].copy()
+            info["final_info"] = {k: v for k, v in info.items() if k != "final_obs"}
+            info["_final_obs"] = info["_final_info"] = done
+            self._start_episodes(ended)
+            obs[ended] = self._observe(self._state())[ended]
+        return obs, reward, terminated, truncated, info
+
+    def advance(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """`step` without autoreset: an ended episode stays where it ended."""
+        if self._rngs is None:
+            raise RuntimeError("call reset() before step()")
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.shape != (self.num_envs, 6):
+            raise ValueError(f"actions must have shape ({self.num_envs}, 6), got {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise ValueError("actions must be finite, got NaN or infinity")
+        actions = np.clip(actions, -1, 1)
+        command = np.where(actions < 0, -actions * self.speed[0], actions * self.speed[1])
+        diverged = self._simulate(command[:, COMMAND_OF_SERVO])
+        self._decisions += 1
+
+        state = self._state()
+        time = self._decisions * self.dt
+        info = self._info(state, command)
+        reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
+        self._reach_time[reach & np.isnan(self._reach_time)] = time[reach & np.isnan(self._reach_time)]
+        reached = ~np.isnan(self._reach_time)
+        column = self._decisions % self._last_miss.shape[1]
+        cranes = np.arange(self.num_envs)
+        self._last_clearance[cranes, column] = info["clearance"]
+        self._last_miss[cranes, column] = info["centre_miss"]
+        self._last_touching[cranes, column] = state.touching
+
+        rule = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
+        truncated = TERMINATIONS[rule] == "time_limit"
+        conditions = success_conditions(
+            reached, self._last_clearance, self._last_touching, self._last_miss
+        )
+        conditions["success"] &= truncated
+        info.update(conditions, termination=TERMINATIONS[rule], time_to_reach=self._reach_time.copy())
+        reward = np.where(
+            diverged, 0.0, info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
+        )
+        return self._observe(state), reward, (rule > 0) & ~truncated, truncated, info
+
+    def _simulate(self, command: np.ndarray) -> np.ndarray:
+        """frame_skip physics steps under servo commands (N, 8); returns which cranes diverged, (N,)."""
+        self._ctrl[:, :8] = self._ctrl[:, 8:] = command
+        # Anti-windup: the integrator leads its joint by no more than the force limit can use. Kept at
+        # zero command, this lead goes on squeezing the log as a hydraulic check valve would.
+        position = self._qpos[:, self._servo_q]
+        self._act[:] = np.clip(self._act, position - self._max_lead, position + self._max_lead)
+        failed = np.zeros(self.num_envs, bool)
+        try:
+            self.batch.step(nstep=self.frame_skip, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        except SimulationError as error:
+            failed[error.ids] = True
+        warned = self.batch.warning[:, :, 1].any(axis=-1)
+        finite = np.isfinite(self._qpos).all(axis=-1) & np.isfinite(self._qvel).all(axis=-1)
+        return failed | warned | ~finite
+
+    def _start_episodes(self, ids: np.ndarray) -> None:
+        """Draw and set a new start for the cranes `ids`."""
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.batch.warning[ids] = 0
+        for i in ids:
+            start_rng, noise_rng = self._rngs[i]
+            q, (x, y, yaw), diameter = sample_start(start_rng, self.difficulty)
+            if self.fixed_diameter is not None:
+                diameter = self.fixed_diameter[i]
+            self._diameter[i] = diameter
+            self._qpos[i, self._q] = q
+            self._qpos[i, self._servo_q] = q[ACTUATED][COMMAND_OF_SERVO]
+            half_yaw = yaw / 2
+            # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
+            turn = np.array([np.cos(half_yaw), -np.cos(half_yaw), -np.sin(half_yaw), np.sin(half_yaw)])
+            self._qpos[i, self._log_qpos] = [x, y, diameter / 2, *(turn / np.sqrt(2))]
+            draws = (1 if self.pose_noise == "episode" else self.max_decisions + 1, 2)
+            if self.pose_noise != "none":
+                self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=draws)
+        radius = self._diameter[ids] / 2
+        mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
+        across = mass * (3 * radius**2 + LOG_LENGTH**2) / 12
+        self._geom_size[ids, self._log_geoms[0], 0] = radius
+        self._geom_size[ids, self._log_geoms[1], 0] = radius
+        self._geom_size[ids, self._log_geoms[1], 1] = LOG_LENGTH / 2 - radius
+        self._body_mass[ids, self._log_body] = mass
+        self._body_inertia[ids, self._log_body] = np.stack(
+            [across, across, mass * radius**2 / 2], axis=-1
+        )
+        self.batch.set_const(ids)  # bounding volumes and inverse weights follow
+        self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        # the integrators start with the static load, so that an idle crane neither sags nor swings
+        load = self._qfrc_bias[np.ix_(ids, self._servo_dq)] / self._servo_kp
+        self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load
+        self._decisions[ids] = 0
+        self._reach_time[ids] = np.nan
+
+    def _state(self) -> CraneState:
+        s = self._sensordata.copy()  # order of the sensors in crane.xml
+        return CraneState(
+            q=self._qpos[:, self._q],
+            dq=self._qvel[:, self._dq],
+            grapple_centre=s[:, 0:3],
+            grapple_axis=s[:, 3:6],
+            log_centre=s[:, 6:9],
+            log_axis=s[:, 9:12],
+            touching=s[:, 12:14] > 0,
+            diameter=self._diameter.copy(),
+        )
+
+    def _observe(self, state: CraneState) -> np.ndarray:
+        """Observations (N, 18), float32, inside the observation space."""
+        delta_p, _, angle = relative_pose(state, self.offset, self.signed_yaw)
+        if self.pose_noise != "none":
+            epsilon = self._noise[np.arange(self.num_envs), self._decisions]
+            delta_p, angle = noisy_pose(delta_p, angle, epsilon)
+        obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
+        space = self.single_observation_space
+        return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32)
+
+    def _info(self, state: CraneState, command: np.ndarray) -> dict[str, np.ndarray]:
+        delta_p, delta_psi, _ = relative_pose(state, self.offset)
+        d_combine = np.linalg.norm(delta_p, axis=-1) + self.omega1 * delta_psi
+        terms = reward_terms(state, d_combine, command, self.reward, self.omega2, self.omega3)
+        return {
+            **dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms.T)),
+            "d_combine": d_combine,
+            "clearance": log_clearance(state),
+            "centre_miss": centre_miss(state),
+        }
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """RGB frames (height, width, 3), one a crane; "human" shows crane 0 in a window."""
+        if self.render_mode == "human":
+            self._show()
+        elif self.render_mode == "rgb_array":
+            return tuple(self.render_crane(i) for i in range(self.num_envs))
+
+    def render_crane(self, i: int, camera: str | None = None) -> np.ndarray:
+        """RGB frame (height, width, 3), uint8, of crane i; cameras: overview, side, grapple."""
+        self._scene_model = self.batch.get_model(i, self._scene_model)
+        self._scene_data = self.batch.get_data(i, self._scene_data)
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self._scene_model, *self._frame_size)
+        self._renderer.update_scene(self._scene_data, camera or self.camera)
+        return self._renderer.render()
+
+    def _show(self) -> None:
+        import mujoco.viewer
+
+        self._scene_model = self.batch.get_model(0, self._scene_model)
+        self._scene_data = self.batch.get_data(0, self._scene_data)
+        if self._viewer is None:
+            self._viewer = mujoco.viewer.launch_passive(self._scene_model, self._scene_data)
+        self._viewer.sync()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+        if self._viewer is not None:
+            self._viewer.close()
+        self._renderer = self._viewer = None
+
+
+class CraneEnv(gymnasium.Env):
+    """One crane: a thin view of `CraneVectorEnv`, whose arguments it takes except num_envs."""
+
+    metadata = CraneVectorEnv.metadata
+
+    def __init__(self, **kwargs: Any):
+        self.envs = CraneVectorEnv(num_envs=1, env_threads=1, **kwargs)
+        self.metadata = {k: v for k, v in self.envs.metadata.items() if k != "autoreset_mode"}
+        self.render_mode = self.envs.render_mode
+        self.observation_space = self.envs.single_observation_space
+        self.action_space = self.envs.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        obs, info = self.envs.reset(seed=seed)
+        self._show()
+        return obs[0], {key: value[0] for key, value in info.items()}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = self.envs.advance(np.asarray(action)[None])
+        self._show()
+        info = {key: value[0] for key, value in info.items()}
+        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
+
+    def render(self) -> np.ndarray | None:
+        frames = self.envs.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        self.envs.close()
+
+
+gymnasium.register(
+    "ForestryCrane-v0", entry_point="crane_env:CraneEnv", vector_entry_point="crane_env:CraneVectorEnv"
+)
