@@ -47,8 +47,9 @@ direction. 0 stops the joint; values outside the box are clipped.
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Sequence
+from typing import Any, NamedTuple
 
 if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
     os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before mujoco is imported
@@ -77,15 +78,11 @@ HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
 MAX_MISS = 0.3  # m along the log
 
-SPEEDS = {  # limits of (q1, q2, q3, q4, q7, q8): rad/s, m/s per stage
-    "real": (
-        np.array([-0.764, -0.326, -0.344, -0.630, -2.12, -1.8]),
-        np.array([0.802, 0.239, 0.326, 0.400, 2.12, 1.8]),
+SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
+    "real": np.array(
+        [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
     ),
-    "mjcf": (
-        -np.array([1.57, 1.57, 1.57, 2.0, 3.0, 3.0]),
-        np.array([1.57, 1.57, 1.57, 2.0, 3.0, 3.0]),
-    ),
+    "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
 }
 JOINTS = ["q1", "q2", "q3", "q4", "q5", "q6", "q7", "q8"]
 SERVOS = ["q1", "q2", "q3", "q4", "q4_stage2", "q7", "q8", "q8_inner"]
@@ -93,15 +90,7 @@ COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
 ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
 LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
 TERMINATIONS = np.array(
-    [
-        "none",
-        "not_reached",
-        "joint_limit",
-        "log_too_far",
-        "overspeed",
-        "diverged",
-        "time_limit",
-    ]
+    "none not_reached joint_limit log_too_far overspeed diverged time_limit".split()
 )
 INTEGRATORS = ("discrete", "implicitfast", "implicit", "Euler")
 SOLVERS = ("Newton", "CG")
@@ -134,9 +123,9 @@ def load_model(
 ) -> mujoco.MjModel:
     """Compile assets/crane.xml.
 
-    contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the jaws'
-    meshes as signed distance fields against the log's cylinder (paper, Sec. III-B); the two numbers
-    are MuJoCo's starting points and gradient steps of the search for contacts (its defaults: 40, 10).
+    contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
+    jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B), with
+    sdf_initpoints starts and sdf_iterations gradient steps of each search for contacts.
     """
     _choice("contact", contact, ("primitive", "sdf"))
     _choice("integrator", integrator, INTEGRATORS)
@@ -171,8 +160,8 @@ def sample_start(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Draw one start: q (8,), log pose (x, y, yaw) in m and rad, log diameter in m.
 
-    difficulty 1 is the full task. Smaller values draw the same start and then move the log towards a
-    point under the grapple, its yaw towards the grapple's and its diameter towards the mean one.
+    difficulty 1 is the full task. Smaller values draw the same start and then move the log towards
+    a point under the grapple, its yaw towards the grapple's, its diameter towards the mean one.
     """
     while True:
         candidates = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3))
@@ -204,9 +193,9 @@ def relative_pose(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], and what is observed of the angle, (N,).
 
-    Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the log's
-    diameter d; see the errata in the README. offset "plus" adds it instead. The last value is
-    Delta_psi, or with signed_yaw the signed angle from grapple to log in rad, in [-pi/2, pi/2).
+    Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
+    log's diameter d (README, errata); offset "plus" adds d_off instead of subtracting it. The last
+    value is Delta_psi, or with signed_yaw the angle from grapple to log, in [-pi/2, pi/2) rad.
     """
     sign = 1.0 if offset == "plus" else -1.0
     delta_p = state.log_centre - state.grapple_centre
@@ -253,9 +242,9 @@ def reward_terms(
 ) -> np.ndarray:
     """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
 
-    d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities in
-    rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one before
-    it, and its r_lift counts twice. Why: README, errata.
+    d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
+    in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
+    before it, and its r_lift counts twice. Why: README, errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -278,11 +267,12 @@ def termination_rule(
     reached: np.ndarray,
     diverged: np.ndarray,
     joint_range: np.ndarray,
-    speed: tuple[np.ndarray, np.ndarray],
+    speed: np.ndarray,
 ) -> np.ndarray:
     """Index into TERMINATIONS of the rule that ends each episode, 0 where it goes on, (N,).
 
-    time (N,) in s since the start, reached (N,) bool, joint_range (8, 2), speed as in SPEEDS.
+    time (N,) in s since the start, reached (N,) bool, joint_range (8, 2) and speed (2, 6), as in
+    SPEEDS, in rad, m and s.
     """
     q, (low, high) = state.q[:, LIMITED], joint_range[LIMITED].T
     distance = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
@@ -303,9 +293,9 @@ def success_conditions(
 ) -> dict[str, np.ndarray]:
     """The one definition of success, for training, evaluation and tests: (N,) bool each.
 
-    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. The others hold the decisions
-    of the last HOLD_TIME of an episode that lasted TIME_LIMIT: clearance (N, W) and miss (N, W) in m,
-    touching (N, W, 2).
+    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. The others hold the W
+    decisions of the last HOLD_TIME of an episode that lasted TIME_LIMIT: clearance and miss (N, W)
+    in m, touching (N, W, 2).
     """
     failed = {
         "not_reached": ~reached,
@@ -334,23 +324,23 @@ def monte_carlo_trials(
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`; SAME_STEP autoreset.
 
-    num_envs: N. env_threads: physics threads, 0 for all cores. frame_skip: physics steps of 5 ms per
-    decision, 20 is 10 Hz, 1 the paper's protocol. speed: command limits, a key of SPEEDS.
+    num_envs: N. env_threads: physics threads, 0 for all cores. frame_skip: physics steps of 5 ms
+    per decision, 20 is 10 Hz, 1 the paper's protocol. speed: command limits, a key of SPEEDS.
     reward: "staged" or "paper", with omega1 (m), omega2 (1/m), omega3 (1/m).
-    offset, signed_yaw: see `relative_pose`. pose_noise: "none", "step" (drawn at every decision) or
-    "episode" (drawn once); it touches the observation only.
-    diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`; may
-    be assigned at any time and holds from the next start on.
+    offset, signed_yaw: see `relative_pose`. pose_noise: "none", "step" (drawn at every decision)
+    or "episode" (drawn once); it touches the observation only.
+    diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
+    may be assigned at any time and holds from the next start on.
     contact, integrator, solver, sdf_initpoints, sdf_iterations: see `load_model`.
 
     Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
 
-    `info` describes the step just made, for every crane, also one that ended with it: `termination`
-    (a name of TERMINATIONS), the terms r_distance, r_grapple, r_lift, r_balance, `d_combine`,
-    `clearance`, `centre_miss` (m), `time_to_reach` (s, nan before), and, meaningful where an episode
-    ended, `success` and its failed conditions `not_reached`, `not_lifted`, `not_held`, `off_centre`.
-    Where episodes ended, `final_obs` and `final_info` hold their end under the masks `_final_obs` and
-    `_final_info`.
+    `info` describes the step just made, for every crane, also one that ended with it:
+    `termination` (a name of TERMINATIONS), the terms r_distance, r_grapple, r_lift, r_balance,
+    `d_combine`, `clearance`, `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful
+    where an episode ended, `success` and its failed conditions `not_reached`, `not_lifted`,
+    `not_held`, `off_centre`. Where episodes ended, `final_obs` and `final_info` hold their end
+    under the masks `_final_obs` and `_final_info`.
     """
 
     metadata = {
@@ -411,7 +401,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         window = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
         self._diameter = np.full(self.num_envs, (D_MIN + D_MAX) / 2)
         self._decisions = np.zeros(self.num_envs, int)
-        self._reach_time = np.full(self.num_envs, np.nan)
+        self._reach_time = np.full(self.num_envs, np.inf)
         self._last_clearance = np.zeros((self.num_envs, window))
         self._last_miss = np.zeros((self.num_envs, window))
         self._last_touching = np.zeros((self.num_envs, window, 2), bool)
@@ -480,15 +470,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if seed is not None or self._rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
                 seeds = np.random.SeedSequence(seed).spawn(self.num_envs)
-            elif len(seed) != self.num_envs:
-                raise ValueError(f"{len(seed)} seeds for {self.num_envs} cranes")
             else:
                 seeds = [np.random.SeedSequence(s) if isinstance(s, int) else s for s in seed]
-            # Two streams, so that pose noise leaves the starts as they are.
-            self._rngs = [
-                tuple(np.random.default_rng(np.random.SeedSequence(s.entropy, spawn_key=(*s.spawn_key, k))) for k in (0, 1))
-                for s in seeds
-            ]
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
+            # starts and pose noise have streams of their own: noise leaves the starts as they are
+            rng = np.random.default_rng
+            self._rngs = [(rng(s), rng(s.generate_state(4))) for s in seeds]
         self._start_episodes(np.arange(self.num_envs))
         state = self._state()
         return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
@@ -496,7 +484,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance every crane by one decision of actions (N, 6); start anew where an episode ends."""
+        """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
         if done.any():
@@ -530,8 +518,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         time = self._decisions * self.dt
         info = self._info(state, command)
         reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
-        self._reach_time[reach & np.isnan(self._reach_time)] = time[reach & np.isnan(self._reach_time)]
-        reached = ~np.isnan(self._reach_time)
+        self._reach_time = np.where(reach, np.minimum(self._reach_time, time), self._reach_time)
+        reached = np.isfinite(self._reach_time)
         column = self._decisions % self._last_miss.shape[1]
         cranes = np.arange(self.num_envs)
         self._last_clearance[cranes, column] = info["clearance"]
@@ -544,17 +532,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             reached, self._last_clearance, self._last_touching, self._last_miss
         )
         conditions["success"] &= truncated
-        info.update(conditions, termination=TERMINATIONS[rule], time_to_reach=self._reach_time.copy())
+        info.update(
+            conditions, termination=TERMINATIONS[rule], time_to_reach=self._reach_time.copy()
+        )
         reward = np.where(
-            diverged, 0.0, info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
+            diverged,
+            0.0,
+            info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"],
         )
         return self._observe(state), reward, (rule > 0) & ~truncated, truncated, info
 
     def _simulate(self, command: np.ndarray) -> np.ndarray:
-        """frame_skip physics steps under servo commands (N, 8); returns which cranes diverged, (N,)."""
+        """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
         self._ctrl[:, :8] = self._ctrl[:, 8:] = command
-        # Anti-windup: the integrator leads its joint by no more than the force limit can use. Kept at
-        # zero command, this lead goes on squeezing the log as a hydraulic check valve would.
+        # Anti-windup: the integrator leads its joint by no more than the force limit can use. Kept
+        # at zero command, this lead goes on squeezing the log as a hydraulic check valve would.
         position = self._qpos[:, self._servo_q]
         self._act[:] = np.clip(self._act, position - self._max_lead, position + self._max_lead)
         failed = np.zeros(self.num_envs, bool)
@@ -567,41 +559,49 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return failed | warned | ~finite
 
     def _start_episodes(self, ids: np.ndarray) -> None:
-        """Draw and set a new start for the cranes `ids`."""
-        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self.batch.warning[ids] = 0
+        """Draw new starts for the cranes `ids`."""
+        starts = []
         for i in ids:
             start_rng, noise_rng = self._rngs[i]
-            q, (x, y, yaw), diameter = sample_start(start_rng, self.difficulty)
-            if self.fixed_diameter is not None:
-                diameter = self.fixed_diameter[i]
-            self._diameter[i] = diameter
-            self._qpos[i, self._q] = q
-            self._qpos[i, self._servo_q] = q[ACTUATED][COMMAND_OF_SERVO]
-            half_yaw = yaw / 2
-            # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
-            turn = np.array([np.cos(half_yaw), -np.cos(half_yaw), -np.sin(half_yaw), np.sin(half_yaw)])
-            self._qpos[i, self._log_qpos] = [x, y, diameter / 2, *(turn / np.sqrt(2))]
+            starts.append(sample_start(start_rng, self.difficulty))
             draws = (1 if self.pose_noise == "episode" else self.max_decisions + 1, 2)
             if self.pose_noise != "none":
                 self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=draws)
-        radius = self._diameter[ids] / 2
+        q, log_pose, diameter = (np.array(column) for column in zip(*starts))
+        if self.fixed_diameter is not None:
+            diameter = self.fixed_diameter[ids]
+        self.place(ids, q, log_pose, diameter)
+
+    def place(
+        self, ids: np.ndarray, q: np.ndarray, log_pose: np.ndarray, diameter: np.ndarray
+    ) -> None:
+        """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.batch.warning[ids] = 0
+        radius = diameter / 2
+        x, y, yaw = log_pose.T
+        # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
+        cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
+        self._qpos[ids, self._log_qpos] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
+        self._qpos[np.ix_(ids, self._q)] = q
+        self._qpos[np.ix_(ids, self._servo_q)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
+
         mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
-        across = mass * (3 * radius**2 + LOG_LENGTH**2) / 12
-        self._geom_size[ids, self._log_geoms[0], 0] = radius
-        self._geom_size[ids, self._log_geoms[1], 0] = radius
-        self._geom_size[ids, self._log_geoms[1], 1] = LOG_LENGTH / 2 - radius
+        across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
+        cylinder, capsule = self._log_geoms
+        self._geom_size[ids, cylinder, 0] = self._geom_size[ids, capsule, 0] = radius
+        self._geom_size[ids, capsule, 1] = LOG_LENGTH / 2 - radius
         self._body_mass[ids, self._log_body] = mass
-        self._body_inertia[ids, self._log_body] = np.stack(
-            [across, across, mass * radius**2 / 2], axis=-1
-        )
+        self._body_inertia[ids, self._log_body] = np.stack([across, across, along], axis=-1)
         self.batch.set_const(ids)  # bounding volumes and inverse weights follow
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+
         # the integrators start with the static load, so that an idle crane neither sags nor swings
-        load = self._qfrc_bias[np.ix_(ids, self._servo_dq)] / self._servo_kp
-        self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load
+        load = self._qfrc_bias[np.ix_(ids, self._servo_dq)]
+        self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load / self._servo_kp
+        self._diameter[ids] = diameter
         self._decisions[ids] = 0
-        self._reach_time[ids] = np.nan
+        self._reach_time[ids] = np.inf
 
     def _state(self) -> CraneState:
         s = self._sensordata.copy()  # order of the sensors in crane.xml
@@ -709,5 +709,7 @@ class CraneEnv(gymnasium.Env):
 
 
 gymnasium.register(
-    "ForestryCrane-v0", entry_point="crane_env:CraneEnv", vector_entry_point="crane_env:CraneVectorEnv"
+    "ForestryCrane-v0",
+    entry_point="crane_env:CraneEnv",
+    vector_entry_point="crane_env:CraneVectorEnv",
 )

@@ -1,4 +1,4 @@
-"""mPPO: proximal policy optimisation with a Beta policy and perturbed actions, on the forestry crane.
+"""mPPO: proximal policy optimisation with a Beta policy and perturbed actions, on the crane.
 
 The paper's own algorithm (Vu et al., Sec. III-B). Three things set it apart from PPO:
 
@@ -9,8 +9,8 @@ The paper's own algorithm (Vu et al., Sec. III-B). Three things set it apart fro
 
 The rest is PPO (Schulman et al., 2017), with generalised advantage estimation:
 
-    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)           V(s_{t+1}) = 0 where an episode terminated,
-    A_t     = delta_t + gamma lambda A_{t+1}            V(final_obs) where it was cut by the time limit
+    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)      V(s_{t+1}) is 0 where an episode terminated and
+    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
@@ -20,7 +20,7 @@ The rest is PPO (Schulman et al., 2017), with generalised advantage estimation:
 """
 
 import os
-import random
+import sys
 import time
 from collections import deque
 from dataclasses import asdict, dataclass
@@ -40,7 +40,8 @@ from tqdm import trange
 import crane_env
 
 ALGORITHM = "mppo_beta"
-A_MIN = 1e-4  # executed a_n stay in [A_MIN, 1 - A_MIN]: at 0 and 1 a Beta log-probability is infinite
+A_MIN = 1e-4  # executed a_n stay in [A_MIN, 1 - A_MIN]: log-probabilities are infinite at 0 and 1
+MAX_LOG_EXCESS = 5.0  # alpha and beta stay below 1 + e^5
 
 
 @dataclass
@@ -59,7 +60,7 @@ class Args:
     resume: str | None = None
     """checkpoint.pt of an interrupted run to go on with; other arguments are then taken from it"""
     paper: bool = False
-    """the paper's protocol: see `paper_protocol`"""
+    """defaults of the paper's protocol (days of training); other arguments still count"""
 
     # --- environment
     env_id: str = "ForestryCrane-v0"
@@ -119,7 +120,7 @@ class Args:
     max_grad_norm: float = 0.5
     """bound of the gradient's norm"""
     perturb: Literal["action", "none", "rpo"] = "action"
-    """action: the paper's Eq. (robust ppo); rpo: shift the mean in the update (Rahman & Xue, 2022)"""
+    """action: Eq. (robust ppo); rpo: shift the mean in the update (Rahman & Xue, 2022)"""
     perturbation: float = 0.1
     """eps, half width of the perturbation of a_n"""
 
@@ -134,16 +135,25 @@ class Args:
     """seed of all evaluation trials"""
 
 
-def paper_protocol(args: Args) -> None:
-    """Set what the paper states (Sec. IV) and say what it leaves open."""
-    args.frame_skip, args.num_envs, args.num_steps = 1, 42, 1000
-    args.update_epochs, args.learning_rate, args.hidden_sizes = 30, 3e-4, (256,) * 4
-    args.total_timesteps, args.reward, args.contact = 500_000_000, "paper", "sdf"
-    args.solver, args.integrator, args.speed = "CG", "implicit", "mjcf"
-    args.perturb, args.perturbation, args.anneal_lr = "action", 0.1, False
-    args.minibatch_size = 2000
-    print("Paper protocol. Guessed, because unpublished: gamma, lambda, clip range, minibatch size,")
-    print("weights of value loss and entropy, omega 1-3, z_l,d, velocity limits, start distribution.")
+# What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
+PAPER = Args(
+    paper=True,
+    total_timesteps=500_000_000,
+    num_envs=42,
+    frame_skip=1,
+    contact="sdf",
+    reward="paper",
+    integrator="implicit",
+    solver="CG",
+    num_steps=1000,
+    hidden_sizes=(256, 256, 256, 256),
+    learning_rate=3e-4,
+    anneal_lr=False,
+    minibatch_size=2000,
+    update_epochs=30,
+)
+PAPER_GUESSES = """Paper's protocol. Guessed, for it does not say: gamma, lambda, clip range,
+minibatch size, weights of value loss and entropy, omega 1-3, z_l,d, speed limits, starts."""
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -194,7 +204,8 @@ class Agent(nn.Module):
 
     def get_distribution(self, obs: torch.Tensor) -> Beta:
         """Beta over a_n in [0, 1], batch shape (B, act_dim), alpha and beta above 1."""
-        alpha, beta = (1 + nn.functional.softplus(self.actor(self.normalize(obs)))).chunk(2, dim=-1)
+        outputs = self.actor(self.normalize(obs)).clamp(max=MAX_LOG_EXCESS)
+        alpha, beta = (1 + outputs.exp()).chunk(2, dim=-1)
         return Beta(alpha, beta, validate_args=False)
 
     def predict(self, obs: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
@@ -207,7 +218,7 @@ class Agent(nn.Module):
 
 
 def shift_mean(distribution: Beta, shift: torch.Tensor) -> Beta:
-    """The Beta whose mean is moved by shift at the same concentration, as far as both stay above 1."""
+    """The Beta with its mean moved by shift at equal concentration, alpha and beta kept above 1."""
     alpha, beta = distribution.concentration1, distribution.concentration0
     concentration = alpha + beta
     moved = torch.clamp(alpha + shift * concentration, min=alpha.new_tensor(1 + 1e-3))
@@ -223,7 +234,7 @@ def compute_gae(
     gamma: float,
     gae_lambda: float,
 ) -> torch.Tensor:
-    """Advantages (T, N). next_values (T, N): V(s_{t+1}), V(final_obs) at truncation, 0 at termination."""
+    """Advantages (T, N). next_values (T, N): V(s_{t+1}), at truncation V(final_obs), else 0."""
     advantages = torch.zeros_like(rewards)
     last = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
@@ -285,7 +296,7 @@ def save_atomically(contents: dict, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__)
+    args = tyro.cli(Args, description=__doc__, default=PAPER if "--paper" in sys.argv else Args())
     checkpoint = None
     if args.resume is not None:
         if not Path(args.resume).is_file():
@@ -295,7 +306,7 @@ if __name__ == "__main__":
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
         args = Args(**{**checkpoint["args"], "resume": args.resume})
     elif args.paper:
-        paper_protocol(args)
+        print(PAPER_GUESSES)
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
     # gamma, lambda and the reward scale are stated per 0.1 s
@@ -303,14 +314,14 @@ if __name__ == "__main__":
     gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
     reward_scale = args.reward_scale * tenths
 
-    random.seed(args.seed)
-    np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     device = torch.device(args.device)
 
     envs = make_envs(args, args.num_envs)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in (obs_space, action_space)):
+    if not all(
+        isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in (obs_space, action_space)
+    ):
         raise SystemExit(f"--env-id: {args.env_id} has no flat Box observations and actions")
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
@@ -381,7 +392,9 @@ if __name__ == "__main__":
                 with torch.no_grad():
                     action = agent.get_distribution(next_obs).sample()
                     if args.perturb == "action":
-                        noise = torch.empty_like(action).uniform_(-args.perturbation, args.perturbation)
+                        noise = torch.empty_like(action).uniform_(
+                            -args.perturbation, args.perturbation
+                        )
                         action = action + noise
                     actions[step] = action.clamp(A_MIN, 1 - A_MIN)
                     env_actions = agent.to_env(actions[step]).cpu().numpy()
@@ -421,7 +434,9 @@ if __name__ == "__main__":
                 next_values = torch.cat([values[1:], agent.get_value(next_obs)[None]])
                 next_values = next_values * (1 - terminations)
                 if final_obs:
-                    last_obs = torch.as_tensor(np.stack(final_obs), dtype=torch.float32, device=device)
+                    last_obs = torch.as_tensor(
+                        np.stack(final_obs), dtype=torch.float32, device=device
+                    )
                     next_values[final_steps, final_cranes] = agent.get_value(last_obs)
                 advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
                 returns = advantages + values
@@ -429,7 +444,7 @@ if __name__ == "__main__":
 
             # ---- update
             stats: dict[str, list[float]] = {}
-            for epoch in range(args.update_epochs):
+            for _ in range(args.update_epochs):
                 for mb in torch.randperm(batch_size, device=device).split(args.minibatch_size):
                     distribution = agent.get_distribution(b_obs[mb])
                     if args.perturb == "rpo":
@@ -439,7 +454,9 @@ if __name__ == "__main__":
                     logratio = distribution.log_prob(b_actions[mb]).sum(-1) - b_logprobs[mb]
                     ratio = logratio.exp()
                     mb_advantages = b_advantages[mb]
-                    mb_advantages = (mb_advantages - mb_advantages.mean()) / (mb_advantages.std() + 1e-8)
+                    mb_advantages = (mb_advantages - mb_advantages.mean()) / (
+                        mb_advantages.std() + 1e-8
+                    )
                     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
                     policy_loss = -torch.min(mb_advantages * ratio, mb_advantages * clipped).mean()
                     value_loss = ((agent.get_value(b_obs[mb]) - b_returns[mb]) ** 2).mean()
@@ -513,8 +530,7 @@ if __name__ == "__main__":
             if iteration % 10 == 0 or last:
                 save(iteration)
     except KeyboardInterrupt:
-        if iteration > first_iteration:
-            save(iteration - 1)
+        save(iteration - 1)
         print(f"\ninterrupted; go on with --resume {run_dir / 'checkpoint.pt'}")
         raise SystemExit(130) from None
     progress.close()

@@ -1,0 +1,306 @@
+"""Judge a policy by the paper's Monte-Carlo protocol: log diameters 0.3 ... 0.8 m, 100 trials each.
+
+    python eval_crane.py                              # the shipped mPPO policy, Tables I and II
+    python eval_crane.py runs/<run>/policy.pt         # any policy of this repository's scripts
+    python eval_crane.py --policy random --trials 20
+    python eval_crane.py --video lift.mp4             # or --viewer, in a window
+
+A trial succeeds as `crane_env.success_conditions` says: log reached within 6 s, and through the
+last 0.5 s of 9 s lifted, held by both jaws, and gripped within 0.3 m of its centre. Trial k of a
+diameter and seed is always the same trial. Intervals are 95 % Wilson score intervals.
+"""
+
+import csv
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import imageio
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+import crane_env
+import mppo_beta_crane
+from crane_env import CraneVectorEnv, monte_carlo_trials
+
+ALGORITHMS = {"mppo_beta": mppo_beta_crane}
+SHIPPED = Path(__file__).parent / "assets" / "policies" / "mppo_beta_crane.pt"
+PAPER = {  # % of 100 trials per diameter in m
+    "none": {0.3: 94, 0.4: 96, 0.5: 98, 0.6: 98, 0.7: 96, 0.8: 96},  # Table I
+    "step": {0.3: 88, 0.4: 94, 0.5: 93, 0.6: 93, 0.7: 92, 0.8: 91},  # Table II
+}
+CRANES = 600  # simulated at once
+Act = Callable[[np.ndarray], np.ndarray]  # observations (N, 18) to actions (N, 6)
+
+
+@dataclass
+class Args:
+    path: Annotated[Path, tyro.conf.Positional] = SHIPPED
+    """policy.pt of a run"""
+    policy: Literal["file", "zero", "random"] = "file"
+    """file: the one at PATH; zero: never move; random: uniform actions"""
+    trials: int = 100
+    """trials per log diameter"""
+    diameters: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+    """log diameters [m]"""
+    seed: int = 20_000
+    """seed of the trials"""
+    contact: Literal["primitive", "sdf"] = "primitive"
+    """contact model of jaws and log"""
+    pose_noise: Literal["none", "step", "episode"] | None = None
+    """error of the observed log pose; unset: the table without and the one with `step`"""
+    stochastic: bool = False
+    """sample actions instead of taking the mean action"""
+    env_threads: int = 0
+    """physics threads, 0 for all cores"""
+    csv: Path | None = None
+    """write one row a trial to this file"""
+    json: bool = False
+    """print one JSON object and nothing else (one table, noise none unless said)"""
+    video: Path | None = None
+    """film one trial per diameter into this .mp4 or .gif instead of evaluating"""
+    camera: Literal["overview", "side", "grapple"] = "overview"
+    """of the video"""
+    viewer: bool = False
+    """show one trial after another in a window instead of evaluating"""
+
+
+def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, str]:
+    """Maker of an acting function with fresh memory, environment arguments, algorithm name."""
+    if not path.is_file():
+        raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        algorithm, args, weights = saved["algorithm"], saved["args"], saved["weights"]
+    except Exception as error:
+        raise SystemExit(f"{path} is no policy.pt of this repository ({error})") from None
+    if algorithm not in ALGORITHMS:
+        raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
+    module = ALGORITHMS[algorithm]
+    known = {field.name for field in fields(module.Args)}
+    args = module.Args(**{key: value for key, value in args.items() if key in known})
+    if not module.is_crane(args):
+        raise SystemExit(f"{path} was trained on {args.env_id}, not on the crane")
+    try:
+        agent = module.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
+        agent.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise SystemExit(f"{path}: weights do not fit a {algorithm} policy: {reason}") from None
+
+    def make_act() -> Act:
+        def act(obs: np.ndarray) -> np.ndarray:
+            with torch.no_grad():
+                return agent.predict(torch.as_tensor(obs), not stochastic).numpy()
+
+        return act
+
+    return make_act, module.crane_kwargs(args), algorithm
+
+
+def fixed_policy(kind: str, seed: int) -> tuple[Callable[[], Act], dict, str]:
+    """`load_policy` for policies without weights."""
+
+    def make_act() -> Act:
+        rng = np.random.default_rng(seed)
+        if kind == "zero":
+            return lambda obs: np.zeros((len(obs), 6))
+        return lambda obs: rng.uniform(-1, 1, (len(obs), 6))
+
+    return make_act, {}, kind
+
+
+def run_trials(make_act: Callable[[], Act], kwargs: dict, diameters, seeds) -> list[dict]:
+    """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m)."""
+    records = []
+    envs = CraneVectorEnv(1, **kwargs)
+    chunks = [slice(i, i + CRANES) for i in range(0, len(seeds), CRANES)]
+    bar = tqdm(total=len(chunks) * envs.max_decisions, desc=f"{len(seeds)} trials", leave=False)
+    for chunk in chunks:
+        envs = CraneVectorEnv(len(seeds[chunk]), diameter=diameters[chunk], **kwargs)
+        obs, _ = envs.reset(seed=seeds[chunk])
+        act, results = make_act(), [None] * envs.num_envs
+        for _ in range(envs.max_decisions):
+            obs, _, terminated, truncated, info = envs.advance(act(obs))
+            for i in np.flatnonzero(terminated | truncated):
+                if results[i] is None:  # the first end of this crane's trial
+                    results[i] = {key: value[i] for key, value in info.items()}
+            bar.update()
+        records += [trial_record(d, result) for d, result in zip(diameters[chunk], results)]
+        envs.close()
+    bar.close()
+    return records
+
+
+def trial_record(diameter: float, info: dict) -> dict:
+    failure = str(info["termination"])
+    if failure == "time_limit":
+        conditions = ["not_reached", "not_lifted", "not_held", "off_centre"]
+        failure = next((name for name in conditions if info[name]), "")
+    return {
+        "diameter": float(diameter),
+        "success": bool(info["success"]),
+        "failure": failure,
+        "time_to_reach": float(info["time_to_reach"]),
+        "centre_miss": float(info["centre_miss"]),
+    }
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % score interval of a success probability (Wilson, 1927)."""
+    z, p = 1.959964, successes / trials
+    centre = (p + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * np.sqrt(p * (1 - p) / trials + z**2 / (4 * trials**2))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def summarize(records: list[dict]) -> list[dict]:
+    """One cell a diameter."""
+    cells = []
+    for d in sorted({r["diameter"] for r in records}):
+        trials = [r for r in records if r["diameter"] == d]
+        successes = sum(r["success"] for r in trials)
+        cells.append(
+            {
+                "diameter": d,
+                "trials": len(trials),
+                "successes": successes,
+                "success_rate": successes / len(trials),
+                "interval": wilson_interval(successes, len(trials)),
+                "failures": dict(Counter(r["failure"] for r in trials if not r["success"])),
+            }
+        )
+    return cells
+
+
+def print_table(records: list[dict], cells: list[dict], noise: str, title: str) -> None:
+    print(f"\n{title}")
+    print("| d [m] | paper % | ours % | 95 % interval | reach [s] | miss [m] | failures |")
+    print("|-------|---------|--------|---------------|-----------|----------|----------|")
+    for cell in cells:
+        good = [r for r in records if r["success"] and r["diameter"] == cell["diameter"]]
+        paper = PAPER.get(noise, {}).get(cell["diameter"], "")
+        reach = f"{np.mean([r['time_to_reach'] for r in good]):.2f}" if good else ""
+        miss = f"{np.mean([r['centre_miss'] for r in good]):.3f}" if good else ""
+        low, high = (100 * bound for bound in cell["interval"])
+        failures = ", ".join(f"{name} {count}" for name, count in cell["failures"].items())
+        print(
+            f"| {cell['diameter']:<5} | {paper:<7} | {100 * cell['success_rate']:<6.1f} "
+            f"| {low:5.1f} - {high:5.1f} | {reach:<9} | {miss:<8} | {failures} |"
+        )
+    wins, trials = sum(c["successes"] for c in cells), sum(c["trials"] for c in cells)
+    low, high = (100 * bound for bound in wilson_interval(wins, trials))
+    paper = f"{np.mean(list(PAPER[noise].values())):.1f}" if noise in PAPER else ""
+    print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
+    print(
+        "Reach (first d_combine < 0.35 m) and miss (grip to log centre) are means of the successes."
+    )
+
+
+def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
+    """One trial per diameter, 20 frames a second; the policy decides as often as in training."""
+    skip = kwargs.pop("frame_skip", 20)
+    substeps = 2 if skip % 20 == 0 else 1
+    frame_every = max(1, round(10 / (skip // substeps)))
+    diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
+    envs = CraneVectorEnv(
+        len(seeds), skip // substeps, diameter=diameters, width=1280, height=720, **kwargs
+    )
+    frames: list[list[np.ndarray]] = [[] for _ in seeds]
+    obs, _ = envs.reset(seed=seeds)
+    act, ended = make_act(), np.zeros(len(seeds), bool)
+    for step in tqdm(range(envs.max_decisions), desc="filming"):
+        if step % substeps == 0:
+            actions = act(obs)
+        obs, _, terminated, truncated, _ = envs.advance(actions)
+        if step % frame_every == 0:
+            for i in np.flatnonzero(~ended):
+                frames[i].append(envs.render_crane(i, args.camera))
+        ended |= terminated | truncated
+    fps = round(1 / (frame_every * envs.dt))
+    with imageio.get_writer(args.video, fps=fps) as video:
+        for frame in (frame for trial in frames for frame in trial):
+            video.append_data(frame)
+    envs.close()
+    print(f"{len(seeds)} trials filmed in {args.video}")
+
+
+def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
+    """Trials in a window, in real time, until Ctrl-C."""
+    envs = CraneVectorEnv(1, render_mode="human", **kwargs)
+    try:
+        obs, _ = envs.reset(seed=args.seed)
+        act = make_act()
+        while True:
+            start = time.time()
+            obs, _, terminated, truncated, info = envs.step(act(obs))
+            envs.render()
+            if terminated[0] or truncated[0]:
+                print("success" if info["success"][0] else f"failed: {info['termination'][0]}")
+                act = make_act()
+            time.sleep(max(0.0, envs.dt - (time.time() - start)))
+    except KeyboardInterrupt:
+        envs.close()
+
+
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    if args.trials < 1:
+        raise SystemExit(f"--trials must be at least 1, got {args.trials}")
+    if not all(crane_env.D_MIN <= d <= crane_env.D_MAX for d in args.diameters):
+        raise SystemExit(f"--diameters must lie in [0.3, 0.8] m, got {args.diameters}")
+    if args.policy == "file":
+        make_act, kwargs, name = load_policy(args.path, args.stochastic)
+        source = str(args.path)
+    else:
+        make_act, kwargs, name = fixed_policy(args.policy, args.seed)
+        source = args.policy
+    torch.set_num_threads(1)  # small batches: more threads only wait for each other
+    kwargs |= {"contact": args.contact, "env_threads": args.env_threads}
+    if args.video or args.viewer:
+        kwargs["pose_noise"] = args.pose_noise or "none"
+        return (film if args.video else show)(make_act, kwargs, args)
+
+    diameters, seeds = monte_carlo_trials(args.seed, args.trials, args.diameters)
+    noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
+    all_records = []
+    for noise in noises:
+        records = run_trials(make_act, {**kwargs, "pose_noise": noise}, diameters, seeds)
+        cells = summarize(records)
+        all_records += [{"pose_noise": noise, **record} for record in records]
+        if args.json:
+            wins = sum(cell["successes"] for cell in cells)
+            result = {
+                "policy": source,
+                "contact": args.contact,
+                "pose_noise": noise,
+                "seed": args.seed,
+                "cells": cells,
+                "mean_success_rate": wins / len(records),
+            }
+            json.dump(result, sys.stdout)
+            print()
+        else:
+            table = {"none": "Table I, clean", "step": "Table II, pose noise"}.get(
+                noise, "Pose noise"
+            )
+            what = (
+                f"{name} ({source}), {args.contact} contact, pose noise {noise}, seed {args.seed}"
+            )
+            print_table(records, cells, noise, f"{table}: {what}")
+    if args.csv:
+        with open(args.csv, "w", newline="") as file:
+            writer = csv.DictWriter(file, all_records[0].keys())
+            writer.writeheader()
+            writer.writerows(all_records)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,344 @@
+"""The environment's contract: spaces, seeds, autoreset, starts, errors."""
+
+import re
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import crane_env
+from crane_env import CraneEnv, CraneVectorEnv
+
+
+def random_actions(rng, n):
+    return rng.uniform(-1, 1, (n, 6))
+
+
+def test_check_env():
+    check_env(gymnasium.make("ForestryCrane-v0").unwrapped, skip_render_check=True)
+
+
+def test_registered_both_ways():
+    env = gymnasium.make("ForestryCrane-v0", frame_skip=5)
+    assert isinstance(env.unwrapped, CraneEnv)
+    envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=3, reward="paper")
+    assert isinstance(envs.unwrapped, CraneVectorEnv) and envs.num_envs == 3
+
+
+def docstring_table(first_column_values):
+    rows = re.findall(r"^\| (\d+) +\|(.*)\|$", crane_env.__doc__, flags=re.M)
+    tables, current = [], []
+    for index, rest in rows:
+        if int(index) == 0 and current:
+            tables.append(current)
+            current = []
+        current.append([cell.strip() for cell in rest.split("|")])
+    tables.append(current)
+    return next(t for t in tables if len(t) == first_column_values)
+
+
+def test_observation_table_matches_the_space():
+    table = docstring_table(18)
+    space = CraneVectorEnv(1).single_observation_space
+    np.testing.assert_allclose([float(r[2]) for r in table], space.low, atol=1e-4)
+    np.testing.assert_allclose([float(r[3]) for r in table], space.high, atol=1e-4)
+    assert space.shape == (18,) and space.dtype == np.float32
+    assert [r[0].split()[0] for r in table[:8]] == crane_env.JOINTS
+    names = [crane_env.JOINTS[i] for i in crane_env.ACTUATED]
+    assert [r[0].split()[0] for r in table[8:14]] == names
+
+
+def test_action_table_matches_the_space_and_speeds():
+    table = docstring_table(6)
+    space = CraneVectorEnv(1).single_action_space
+    np.testing.assert_allclose([float(r[2]) for r in table], space.low)
+    np.testing.assert_allclose([float(r[3]) for r in table], space.high)
+    for column, speed in ((4, "real"), (5, "mjcf")):
+        documented = [re.findall(r"-?\d+\.?\d*", r[column])[:2] for r in table]
+        np.testing.assert_allclose(np.array(documented, float).T, crane_env.SPEEDS[speed])
+
+
+def test_observation_holds_what_the_table_says():
+    envs = CraneVectorEnv(4)
+    obs, _ = envs.reset(seed=0)
+    for _ in range(5):
+        obs, *_ = envs.advance(np.full((4, 6), 0.3))
+    state = envs._state()
+    np.testing.assert_allclose(obs[:, :8], state.q, rtol=1e-5, atol=1e-6)
+    for k, name in enumerate(["q1", "q2", "q3", "q4", "q7", "q8"]):
+        np.testing.assert_allclose(obs[:, 8 + k], envs.batch.joint(name).qvel[:, 0], atol=1e-5)
+    delta_p, delta_psi, _ = crane_env.relative_pose(state)
+    np.testing.assert_allclose(obs[:, 14:17], delta_p, atol=1e-5)
+    np.testing.assert_allclose(obs[:, 17], delta_psi, atol=1e-5)
+
+
+def test_observations_stay_in_the_space():
+    envs = CraneVectorEnv(32, speed="mjcf", signed_yaw=True, pose_noise="step")
+    rng = np.random.default_rng(0)
+    obs, _ = envs.reset(seed=0)
+    for _ in range(60):
+        assert obs in envs.observation_space
+        obs, *_ = envs.step(random_actions(rng, 32))
+
+
+def test_a_crane_is_the_same_for_any_number_of_cranes_and_threads():
+    def episode(n, threads):
+        envs = CraneVectorEnv(n, env_threads=threads, pose_noise="step")
+        rng = np.random.default_rng(1)
+        actions = rng.uniform(-1, 1, (150, 6))  # long enough for autoresets
+        obs = [envs.reset(seed=7)[0][2]]
+        for action in actions:
+            step = envs.step(np.tile(action, (n, 1)))
+            obs.append(np.append(step[0][2], step[1][2]))
+        return np.concatenate(obs)
+
+    reference = episode(3, 1)
+    for n, threads in [(3, 2), (17, 1), (17, 2)]:
+        np.testing.assert_array_equal(reference, episode(n, threads))
+
+
+def test_one_crane_env_is_the_vector_env():
+    env, envs = CraneEnv(), CraneVectorEnv(1)
+    a, _ = env.reset(seed=5)
+    b, _ = envs.reset(seed=5)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        np.testing.assert_array_equal(a, b[0])
+        actions = random_actions(rng, 1)
+        a, reward_a, terminated, truncated, info = env.step(actions[0])
+        b, reward_b, *_ = envs.advance(actions)
+        assert reward_a == reward_b[0]
+        assert isinstance(info["termination"], str)
+        if terminated or truncated:
+            break
+
+
+def test_frame_skip_changes_the_decisions_not_the_physics():
+    """Same start and commands at 10 and 200 Hz: joints within 2 mrad (mm), grapple within 5 mm."""
+    ends = []
+    for frame_skip in (1, 20):
+        envs = CraneVectorEnv(8, frame_skip=frame_skip)
+        envs.reset(seed=2)
+        for k in range(30):
+            action = 0.5 * np.sin(np.arange(6) + k / 5)
+            for _ in range(20 // frame_skip):
+                envs.advance(np.tile(action, (8, 1)))
+        ends.append(envs._state())
+    assert np.abs(ends[0].q - ends[1].q).max() < 2e-3
+    assert np.abs(ends[0].grapple_centre - ends[1].grapple_centre).max() < 5e-3
+    assert np.abs(ends[0].q[:, 0]).max() > 0.1  # it did move
+
+
+def test_same_step_autoreset():
+    envs = CraneVectorEnv(8)
+    obs, _ = envs.reset(seed=0)
+    twin = CraneVectorEnv(8)
+    twin.reset(seed=0)
+    action = np.zeros((8, 6))
+    action[::2, 0] = 1.0
+    for _ in range(60):  # at the latest, an episode ends as not_reached after 6 s
+        obs, _, terminated, _, info = envs.step(action)
+        twin_obs, _, _, _, twin_info = twin.advance(action)
+        if terminated.any():
+            break
+    assert terminated.any() and not terminated.all()
+    assert (info["_final_obs"] == terminated).all() and (info["_final_info"] == terminated).all()
+    for i in np.flatnonzero(terminated):
+        np.testing.assert_array_equal(info["final_obs"][i], twin_obs[i])
+        assert info["final_info"]["termination"][i] == twin_info["termination"][i] != "none"
+        assert np.abs(obs[i, 8:14]).max() == 0  # the new start is at rest
+        assert not np.allclose(obs[i], twin_obs[i])
+
+
+def test_returned_arrays_are_not_live():
+    envs = CraneVectorEnv(2)
+    obs, info = envs.reset(seed=0)
+    before, clearance = obs.copy(), info["clearance"].copy()
+    envs.step(np.ones((2, 6)))
+    np.testing.assert_array_equal(obs, before)
+    np.testing.assert_array_equal(info["clearance"], clearance)
+
+
+def test_start_distribution():
+    """Ranges and uniformity as fixed for the task."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    starts = [crane_env.sample_start(rng) for _ in range(n)]
+    q = np.array([s[0] for s in starts])
+    log = np.array([s[1] for s in starts])
+    diameter = np.array([s[2] for s in starts])
+    hanging = np.pi / 2 - q[:, 1] - q[:, 2]
+    uniform = {
+        "q1": (q[:, 0], -2 * np.pi / 3, -np.pi / 3),
+        "q5": (q[:, 4] - hanging, -0.05, 0.05),
+        "q6": (q[:, 5] - np.pi / 2, -0.05, 0.05),
+        "q7": (q[:, 6], -np.pi / 2, np.pi / 2),
+        "q8": (q[:, 7], 0.05, 0.6),
+        "radius": (np.hypot(log[:, 0], log[:, 1]), 5.5, 7.5),
+        "azimuth": (np.arctan2(log[:, 1], log[:, 0]), -2 * np.pi / 3, -np.pi / 3),
+        "yaw": (log[:, 2], -np.pi / 2, np.pi / 2),
+        "diameter": (diameter, 0.3, 0.8),
+    }
+    for name, (values, low, high) in uniform.items():
+        assert low - 1e-9 <= values.min() and values.max() <= high + 1e-9, name
+        cdf = (np.sort(values) - low) / (high - low)
+        kolmogorov = np.abs(cdf - (np.arange(n) + 0.5) / n).max()
+        assert kolmogorov < 1.63 / np.sqrt(n), name  # the 1 % point
+    for values, low, high in [(q[:, 1], 0.1, 1.0), (q[:, 2], -0.6, 0.8), (q[:, 3], 0.05, 1.0)]:
+        assert low <= values.min() and high - 0.1 < values.max() <= high
+    out, up = crane_env.tip_position(*q[:, 1:4].T)
+    assert (4.5 <= out).all() and (out <= 8).all() and (2.7 <= up).all() and (up <= 4.2).all()
+    assert (q[:, 1] + q[:, 2] > 0.05).all()
+    correlation = np.corrcoef(
+        np.column_stack([q[:, 0], q[:, 6], q[:, 7], log[:, 2], np.hypot(*log[:, :2].T), diameter]).T
+    )
+    assert np.abs(correlation - np.eye(6)).max() < 0.06
+
+
+def test_the_world_starts_as_sampled():
+    envs = CraneVectorEnv(6)
+    envs.reset(seed=11)
+    for i, seed in enumerate(np.random.SeedSequence(11).spawn(6)):
+        q, (x, y, yaw), diameter = crane_env.sample_start(np.random.default_rng(seed))
+        state = envs._state()
+        np.testing.assert_allclose(state.q[i], q)
+        np.testing.assert_allclose(state.log_centre[i], [x, y, diameter / 2], atol=1e-12)
+        np.testing.assert_allclose(state.log_axis[i], [-np.sin(yaw), np.cos(yaw), 0], atol=1e-12)
+        np.testing.assert_allclose(envs._diameter[i], diameter)
+    assert np.abs(state.dq).max() == 0
+    assert not envs._state().touching.any()
+
+
+def test_pose_noise_leaves_the_starts_alone():
+    reference, _ = CraneVectorEnv(4).reset(seed=3)
+    for noise in ("step", "episode"):
+        envs = CraneVectorEnv(4, pose_noise=noise)
+        obs, _ = envs.reset(seed=3)
+        np.testing.assert_array_equal(obs[:, :14], reference[:, :14])
+        assert np.abs(obs[:, 14:] - reference[:, 14:]).max() > 1e-4
+
+
+def test_pose_noise_is_kept_or_redrawn():
+    for noise, redrawn in [("step", True), ("episode", False)]:
+        envs = CraneVectorEnv(1, pose_noise=noise)
+        envs.reset(seed=3)
+        factors = []
+        for _ in range(4):
+            obs, *_ = envs.advance(np.zeros((1, 6)))
+            delta_p, _, _ = crane_env.relative_pose(envs._state())
+            decay = (delta_p**2).sum() / 64
+            factors.append((obs[0, 14] / delta_p[0, 0] - 1) / decay)
+        assert (np.ptp(factors) > 0.01) == redrawn
+        assert np.abs(factors).max() < 0.1 + 1e-3
+
+
+def test_difficulty():
+    envs = CraneVectorEnv(64, difficulty=0.0)
+    envs.reset(seed=0)
+    state = envs._state()
+    delta_p, delta_psi, _ = crane_env.relative_pose(state)
+    assert delta_psi.max() < 1e-2  # aligned but for the swing
+    easy = np.linalg.norm(delta_p[:, :2], axis=-1)
+    np.testing.assert_allclose(envs._diameter, 0.55)
+    envs.difficulty = 1.0
+    envs.reset(seed=0)
+    delta_p, _, _ = crane_env.relative_pose(envs._state())
+    assert easy.max() < 1.2 and np.linalg.norm(delta_p[:, :2], axis=-1).max() > 3
+    rng_easy, rng_full = np.random.default_rng(9), np.random.default_rng(9)
+    np.testing.assert_array_equal(
+        crane_env.sample_start(rng_easy, 0.3)[0], crane_env.sample_start(rng_full, 1.0)[0]
+    )
+
+
+def test_trials_do_not_depend_on_how_many_there_are():
+    few = crane_env.monte_carlo_trials(5, 2, (0.4,))
+    many = crane_env.monte_carlo_trials(5, 10, (0.3, 0.4))
+    starts = []
+    for diameters, seeds in (few, many):
+        envs = CraneVectorEnv(len(seeds), diameter=diameters)
+        starts.append(envs.reset(seed=seeds)[0])
+    np.testing.assert_array_equal(starts[0], starts[1][10:12])
+    assert len(np.unique(starts[1][:, 0])) == 20
+
+
+def test_action_is_a_fraction_of_the_speed_limit():
+    envs = CraneVectorEnv(2)
+    envs.reset(seed=0)
+    envs.advance(np.array([[-0.5] * 6, [0.5] * 6]))
+    low, high = crane_env.SPEEDS["real"]
+    expected = np.stack([0.5 * low, 0.5 * high])[:, crane_env.COMMAND_OF_SERVO]
+    np.testing.assert_allclose(envs._ctrl[:, :8], expected)
+    np.testing.assert_allclose(envs._ctrl[:, 8:], expected)
+    envs.advance(np.full((2, 6), 7.0))  # beyond the box: clipped
+    np.testing.assert_allclose(envs._ctrl[0, :8], high[crane_env.COMMAND_OF_SERVO])
+
+
+@pytest.mark.parametrize(
+    "kwargs, words",
+    [
+        ({"diameter": 0.29}, "diameter"),
+        ({"diameter": [0.5, 0.9]}, "diameter"),
+        ({"num_envs": 0}, "num_envs"),
+        ({"frame_skip": 0}, "frame_skip"),
+        ({"frame_skip": 2.5}, "frame_skip"),
+        ({"contact": "soft"}, "contact must be one of 'primitive', 'sdf'"),
+        ({"reward": "dense"}, "reward"),
+        ({"speed": "fast"}, "speed"),
+        ({"offset": "none"}, "offset"),
+        ({"pose_noise": "much"}, "pose_noise"),
+        ({"integrator": "RK45"}, "integrator"),
+        ({"solver": "LU"}, "solver"),
+        ({"difficulty": 1.5}, "difficulty"),
+        ({"render_mode": "ascii"}, "render_mode"),
+    ],
+)
+def test_bad_arguments(kwargs, words):
+    with pytest.raises(ValueError, match=words):
+        CraneVectorEnv(**{"num_envs": 2, **kwargs})
+
+
+def test_bad_calls():
+    envs = CraneVectorEnv(2)
+    with pytest.raises(RuntimeError, match="reset"):
+        envs.step(np.zeros((2, 6)))
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(2, 6\)"):
+        envs.step(np.zeros((2, 5)))
+    with pytest.raises(ValueError, match="NaN"):
+        envs.step(np.full((2, 6), np.nan))
+    with pytest.raises(ValueError, match="seeds"):
+        envs.reset(seed=[1, 2, 3])
+    env = CraneEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="shape"):
+        env.step(np.zeros(5))
+
+
+def test_divergence_is_reported_and_recovered():
+    envs = CraneVectorEnv(3)
+    envs.reset(seed=0)
+    envs._qvel[1] = np.nan
+    obs, reward, terminated, truncated, info = envs.step(np.zeros((3, 6)))
+    assert info["termination"].tolist() == ["none", "diverged", "none"]
+    assert terminated.tolist() == [False, True, False] and reward[1] == 0
+    assert np.isfinite(obs).all() and np.isfinite(info["final_obs"][1]).all()
+    _, _, terminated, _, info = envs.step(np.zeros((3, 6)))
+    assert not terminated.any() and set(info["termination"]) == {"none"}
+
+
+def test_render():
+    mujoco = pytest.importorskip("mujoco")
+    try:
+        mujoco.Renderer(crane_env.load_model(), 8, 8).close()
+    except Exception as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    env = gymnasium.make("ForestryCrane-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (480, 640, 3) and first.dtype == np.uint8
+    assert first.std() > 10  # a scene, not a blank
+    for _ in range(20):
+        env.step(np.array([1, 0, 0, 0, 0, 0], np.float32))
+    assert np.abs(env.render().astype(int) - first).max() > 50
+    env.close()

@@ -1,0 +1,214 @@
+"""Pose, noise, rewards, rules and success against values worked out by hand."""
+
+import numpy as np
+import pytest
+
+import crane_env
+from crane_env import CraneState, CraneVectorEnv
+
+JOINT_RANGE = CraneVectorEnv(1).joint_range
+REAL = crane_env.SPEEDS["real"]
+
+
+def state(**changes):
+    """One hanging crane and a 0.4 m log on the ground along y, 3 m ahead and 4 m to the left."""
+    values = {
+        "q": np.array([0.0, 0.5, 0.2, 0.5, 0.87, np.pi / 2, 0.0, 1.5]),
+        "dq": np.zeros(6),
+        "grapple_centre": np.array([1.0, 2.0, 1.5]),
+        "grapple_axis": np.array([0.6, 0.8, 0.0]),
+        "log_centre": np.array([4.0, 6.0, 0.2]),
+        "log_axis": np.array([0.0, 1.0, 0.0]),
+        "touching": np.array([True, True]),
+        "diameter": np.array(0.4),
+    }
+    values.update({k: np.asarray(v) for k, v in changes.items()})
+    return CraneState(**{k: v[None] for k, v in values.items()})
+
+
+def test_relative_pose():
+    # offset (0.8 - 0.4) / 2 = 0.2: target heights 0.2 - 0.2 = 0 and 0.2 + 0.2 = 0.4
+    delta_p, delta_psi, observed = crane_env.relative_pose(state())
+    np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.5]])
+    np.testing.assert_allclose(delta_psi, [0.2])  # 1 - |0.6 * 0 + 0.8 * 1|
+    np.testing.assert_allclose(observed, [0.2])
+    delta_p, _, _ = crane_env.relative_pose(state(), offset="plus")
+    np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.1]])
+
+
+def test_angle_is_that_of_a_line_not_of_an_arrow():
+    for axis in ([0.0, 1.0, 0.0], [0.0, -1.0, 0.0]):
+        _, delta_psi, signed = crane_env.relative_pose(state(log_axis=axis), signed_yaw=True)
+        np.testing.assert_allclose(delta_psi, [0.2])
+        # the grapple points atan2(0.8, 0.6) = 53.13 degrees, the log 90: 36.87 degrees to the left
+        np.testing.assert_allclose(signed, [np.radians(36.8698976)])
+    right = np.array([np.cos(0.1), np.sin(0.1), 0.0])
+    _, _, signed = crane_env.relative_pose(state(log_axis=right), signed_yaw=True)
+    np.testing.assert_allclose(signed, [0.1 - np.arctan2(0.8, 0.6)])
+
+
+def test_yaw_of_a_tilted_log_is_that_of_its_shadow():
+    tilted = np.array([0.0, 0.8, 0.6])
+    _, delta_psi, _ = crane_env.relative_pose(state(log_axis=tilted))
+    np.testing.assert_allclose(delta_psi, [0.2])
+
+
+def test_noise():
+    # s = (|(0, 4.8, 6.4)| / 8)^2 = 1; and s = 0.25 at half the distance
+    noisy_p, noisy_psi = crane_env.noisy_pose(
+        np.array([[0.0, 4.8, 6.4], [0.0, 2.4, 3.2]]),
+        np.array([0.5, 0.5]),
+        np.array([[0.1, -0.1], [0.1, -0.1]]),
+    )
+    np.testing.assert_allclose(noisy_p, [[0.0, 5.28, 7.04], [0.0, 2.46, 3.28]])
+    np.testing.assert_allclose(noisy_psi, [0.45, 0.4875])
+
+
+def test_clearance_and_miss():
+    np.testing.assert_allclose(crane_env.log_clearance(state()), [0.0])
+    lifted = state(log_centre=[4.0, 6.0, 1.5], log_axis=[0.0, 0.8, 0.6])
+    # 1.5 - 1.375 * 0.6 - 0.2 * 0.8
+    np.testing.assert_allclose(crane_env.log_clearance(lifted), [0.515])
+    upright = state(log_centre=[4.0, 6.0, 2.0], log_axis=[0.0, 0.0, -1.0])
+    np.testing.assert_allclose(crane_env.log_clearance(upright), [0.625])
+    gripped = state(grapple_centre=[4.3, 6.4, 0.2], log_axis=[0.6, 0.8, 0.0])
+    np.testing.assert_allclose(crane_env.centre_miss(gripped), [0.5])
+
+
+COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 0.0]])  # norm 0.5
+
+
+def test_staged_reward():
+    terms = crane_env.reward_terms(
+        state(log_centre=[4.0, 6.0, 0.7]), np.array([0.25]), COMMAND, omega2=2.0
+    )
+    r = np.exp(-0.5)  # q8 / 3 = 0.5, clearance 0.7 - 0.2 = 0.5
+    calm = 1 - np.tanh(0.5)
+    np.testing.assert_allclose(terms, [[r, 0.5 * r, 2 * 0.5 * r, calm * 0.5 * r]])
+    high = crane_env.reward_terms(state(log_centre=[4.0, 6.0, 3.2]), np.array([0.25]), COMMAND)
+    np.testing.assert_allclose(high[0, 2], 2 * np.exp(-0.25))  # clearance counts up to 1 m
+
+
+def test_paper_reward():
+    terms = crane_env.reward_terms(
+        state(log_centre=[4.0, 6.0, 0.7]), np.array([0.25]), COMMAND, "paper", 2.0, 3.0
+    )
+    r = np.exp(-0.5)
+    grapple = 0.5 * r + 0.5 * (1 - r)
+    lift = (1 - np.tanh(3.0 * 0.3)) * (1 - grapple)
+    balance = (1 - np.tanh(0.5)) * (1 - lift)
+    np.testing.assert_allclose(terms, [[r, grapple, lift, balance]])
+
+
+def test_printed_reward_pays_for_standing_still():
+    """Why "staged" is the default: open jaws at rest earn the same at any distance."""
+    still, open_jaws = np.zeros((1, 6)), np.array([0, 0.5, 0.2, 0.5, 0.87, np.pi / 2, 0, 0.0])
+    for d in (0.1, 5.0):
+        terms = crane_env.reward_terms(state(q=open_jaws), np.array([d]), still, "paper")
+        np.testing.assert_allclose(terms[0, 0] + terms[0, 1], 1.0)
+        assert terms[0, 3] > 0.6
+
+
+def rule(time=1.0, reached=True, diverged=False, **changes):
+    code = crane_env.termination_rule(
+        state(**changes),
+        np.array([time]),
+        np.array([reached]),
+        np.array([diverged]),
+        JOINT_RANGE,
+        REAL,
+    )
+    return str(crane_env.TERMINATIONS[code[0]])
+
+
+@pytest.mark.parametrize(
+    "expected, situation",
+    [
+        ("none", {}),
+        ("none", {"time": 5.99, "reached": False}),
+        ("not_reached", {"time": 6.0, "reached": False}),
+        ("none", {"time": 8.95}),
+        ("time_limit", {"time": 9.0}),
+        ("none", {"grapple_centre": [4.0, 6.0, 8.1]}),
+        ("log_too_far", {"grapple_centre": [4.0, 6.0, 8.3]}),
+        ("none", {"dq": [0, 0.47, 0, 0, 0, 0]}),
+        ("overspeed", {"dq": [0, 0.49, 0, 0, 0, 0]}),  # twice 0.239
+        ("none", {"dq": [0, -0.64, 0, 0, 0, 0]}),
+        ("overspeed", {"dq": [0, -0.66, 0, 0, 0, 0]}),  # twice 0.326
+        ("diverged", {"diverged": True, "time": 9.0}),
+    ],
+)
+def test_termination_rule(expected, situation):
+    assert rule(**situation) == expected
+
+
+@pytest.mark.parametrize("joint", range(8))
+@pytest.mark.parametrize("end", [0, 1])
+def test_joint_limits_end_the_episode_but_not_those_of_the_jaws(joint, end):
+    q = state().q[0].copy()
+    q[joint] = JOINT_RANGE[joint, end] + (-0.001, 0.001)[end]
+    assert rule(q=q) == ("none" if joint == 7 else "joint_limit")
+    q[joint] = JOINT_RANGE[joint, end] - (-0.001, 0.001)[end]
+    assert rule(q=q) == "none"
+
+
+def conditions(reached=True, clearance=0.2, touching=True, miss=0.1, at=None):
+    """Six last decisions that all hold, except `at`, which has the given values."""
+    values = [np.full((1, 6), 0.2), np.full((1, 6, 2), True), np.full((1, 6), 0.1)]
+    where = slice(None) if at is None else at
+    values[0][0, where], values[1][0, where, 1], values[2][0, where] = clearance, touching, miss
+    result = crane_env.success_conditions(np.array([reached]), *values)
+    return {name for name, value in result.items() if value[0]}
+
+
+def test_success_conditions():
+    assert conditions() == {"success"}
+    assert conditions(reached=False) == {"not_reached"}
+    for at in range(6):  # each decision of the last half second counts
+        assert conditions(clearance=0.099, at=at) == {"not_lifted"}
+        assert conditions(touching=False, at=at) == {"not_held"}
+        assert conditions(miss=0.301, at=at) == {"off_centre"}
+    assert conditions(clearance=0.1, miss=0.3) == {"success"}
+    assert conditions(clearance=0.0, touching=False) == {"not_lifted", "not_held"}
+
+
+def test_success_needs_the_whole_episode():
+    """The window holds the last 0.5 s, and success comes with the time limit only."""
+    for frame_skip, window in [(20, 6), (1, 101), (4, 26)]:
+        envs = CraneVectorEnv(1, frame_skip=frame_skip)
+        assert envs._last_miss.shape[1] == window
+        assert envs.max_decisions * frame_skip == 1800
+    envs = CraneVectorEnv(1)
+    envs.reset(seed=0)
+    for k in range(90):
+        envs._reach_time[:] = 1.0  # stand still but claim to have reached the log
+        _, _, terminated, truncated, info = envs.advance(np.zeros((1, 6)))
+        assert not terminated[0] and truncated[0] == (k == 89) and not info["success"][0]
+    assert info["termination"][0] == "time_limit" and info["not_lifted"][0] and info["not_held"][0]
+
+
+def test_reward_is_the_sum_of_the_reported_terms():
+    for reward in ("staged", "paper"):
+        envs = CraneVectorEnv(4, reward=reward)
+        envs.reset(seed=0)
+        _, total, _, _, info = envs.advance(np.full((4, 6), 0.5))
+        terms = [info[f"r_{name}"] for name in ("distance", "grapple", "lift", "balance")]
+        np.testing.assert_allclose(total, np.sum(terms, axis=0))
+
+
+def test_time_to_reach_is_the_first_time():
+    envs = CraneVectorEnv(1, difficulty=0.0)
+    envs.reset(seed=0)
+    q = envs._state().q.copy()
+    for q4 in np.linspace(q[0, 3], 2.2, 400):  # hang the grapple into its target
+        out, up = crane_env.tip_position(q[0, 1], q[0, 2], q4)
+        if up < 0.55 + 0.1 + 0.791:
+            break
+    q[0, 3] = q4
+    log = np.array([[out * np.cos(q[0, 0]), out * np.sin(q[0, 0]), q[0, 0] - q[0, 6]]])
+    envs.place(np.array([0]), q, log, np.array([0.55]))
+    assert np.isinf(envs._reach_time[0])
+    for _ in range(3):
+        *_, info = envs.advance(np.zeros((1, 6)))
+        assert info["d_combine"][0] < 0.35
+        assert info["time_to_reach"][0] == pytest.approx(0.1)
