@@ -1,0 +1,51 @@
+"""Turn a run's TensorBoard events into a CSV file, one row an update.
+
+python benchmark/export_curve.py runs/<run> benchmark/curves/<name>.csv
+"""
+
+import csv
+import sys
+from pathlib import Path
+
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+COLUMNS = {
+    "charts/updates": "updates",
+    "charts/episodic_return": "episodic_return",
+    "charts/episodic_length": "episodic_length",
+    "charts/success_rate": "training_success_rate",
+    "charts/SPS": "decisions_per_second",
+    "losses/approx_kl": "approx_kl",
+    "eval/success_rate": "eval_success_rate",
+    "eval/episodic_return": "eval_episodic_return",
+    "final/success_rate": "final_success_rate",
+}
+
+
+def export(run_dir: Path, csv_path: Path) -> None:
+    """Rows by decision count; wall_time_s counts from the end of the first update."""
+    events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
+    events.Reload()
+    rows: dict[int, dict] = {}
+    for tag, column in COLUMNS.items():
+        if tag in events.Tags()["scalars"]:
+            for event in events.Scalars(tag):
+                row = rows.setdefault(event.step, {"decisions": event.step})
+                row[column] = round(event.value, 5)
+                row["wall_time"] = max(row.get("wall_time", 0.0), event.wall_time)
+    if not rows:
+        raise SystemExit(f"{run_dir} holds no TensorBoard scalars")
+    start = min(row["wall_time"] for row in rows.values())
+    for row in rows.values():
+        row["wall_time_s"] = round(row.pop("wall_time") - start, 1)
+    csv_path.parent.mkdir(parents=True, exist_ok=True)
+    with open(csv_path, "w", newline="") as file:
+        writer = csv.DictWriter(file, ["decisions", "wall_time_s", *COLUMNS.values()])
+        writer.writeheader()
+        writer.writerows(rows[step] for step in sorted(rows))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        raise SystemExit(__doc__)
+    export(Path(sys.argv[1]), Path(sys.argv[2]))

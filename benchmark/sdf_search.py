@@ -1,0 +1,50 @@
+"""How cheap may MuJoCo's search for SDF contacts be? One policy, 120 trials, several settings.
+
+A setting agrees with MuJoCo's default (40 starting points, 10 iterations) in a trial when both succeed
+or both fail. Writes benchmark/sdf_search.csv.
+
+    python benchmark/sdf_search.py [policy.pt]
+"""
+
+import csv
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+
+import eval_crane  # noqa: E402
+from crane_env import monte_carlo_trials  # noqa: E402
+
+SETTINGS = [(40, 10), (20, 10), (10, 10), (8, 5), (4, 5), (4, 3), (2, 3)]
+SEED, TRIALS = 30_000, 20  # trials per diameter
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    path = Path(sys.argv[1]) if len(sys.argv) > 1 else eval_crane.SHIPPED
+    make_act, kwargs, _ = eval_crane.load_policy(path, stochastic=False)
+    diameters, seeds = monte_carlo_trials(SEED, TRIALS)
+    rows, reference = [], None
+    for initpoints, iterations in SETTINGS:
+        options = {"contact": "sdf", "sdf_initpoints": initpoints, "sdf_iterations": iterations}
+        start = time.perf_counter()
+        records = eval_crane.run_trials(make_act, {**kwargs, **options}, diameters, seeds)
+        seconds = time.perf_counter() - start
+        success = np.array([record["success"] for record in records])
+        reference = success if reference is None else reference
+        row = {
+            "sdf_initpoints": initpoints,
+            "sdf_iterations": iterations,
+            "success_rate": success.mean().round(4),
+            "agreement": (success == reference).mean().round(4),
+            "seconds": round(seconds, 1),
+        }
+        rows.append(row)
+        print(row, flush=True)
+    with open(Path(__file__).parent / "sdf_search.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
