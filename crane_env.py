@@ -92,8 +92,9 @@ LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
 TERMINATIONS = np.array(
     "none not_reached joint_limit log_too_far overspeed diverged time_limit".split()
 )
-INTEGRATORS = ("discrete", "implicitfast", "implicit", "Euler")
-SOLVERS = ("Newton", "CG")
+
+
+Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
 
 class CraneState(NamedTuple):
@@ -128,8 +129,8 @@ def load_model(
     sdf_initpoints starts and sdf_iterations gradient steps of each search for contacts.
     """
     _choice("contact", contact, ("primitive", "sdf"))
-    _choice("integrator", integrator, INTEGRATORS)
-    _choice("solver", solver, SOLVERS)
+    _choice("integrator", integrator, ("implicitfast", "implicit", "discrete", "Euler"))
+    _choice("solver", solver, ("Newton", "CG"))
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
@@ -343,11 +344,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     under the masks `_final_obs` and `_final_info`.
     """
 
-    metadata = {
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": 10,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
 
     def __init__(
         self,
@@ -421,7 +419,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.render_mode, self.camera = render_mode, camera
         self._frame_size = (height, width)
         self._renderer = self._viewer = self._scene_model = self._scene_data = None
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
     def _bind(self, batch: Batch, model: mujoco.MjModel) -> None:
         """Live views of the engine's arrays, and where in them our joints are."""
@@ -471,7 +469,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             if seed is None or isinstance(seed, (int, np.integer)):
                 seeds = np.random.SeedSequence(seed).spawn(self.num_envs)
             else:
-                seeds = [np.random.SeedSequence(s) if isinstance(s, int) else s for s in seed]
+                sequence = np.random.SeedSequence
+                seeds = [s if isinstance(s, sequence) else sequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
             # starts and pose noise have streams of their own: noise leaves the starts as they are
@@ -481,9 +480,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         state = self._state()
         return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> Step:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
@@ -498,9 +495,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             obs[ended] = self._observe(self._state())[ended]
         return obs, reward, terminated, truncated, info
 
-    def advance(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def advance(self, actions: np.ndarray) -> Step:
         """`step` without autoreset: an ended episode stays where it ended."""
         if self._rngs is None:
             raise RuntimeError("call reset() before step()")
@@ -532,14 +527,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             reached, self._last_clearance, self._last_touching, self._last_miss
         )
         conditions["success"] &= truncated
-        info.update(
-            conditions, termination=TERMINATIONS[rule], time_to_reach=self._reach_time.copy()
-        )
-        reward = np.where(
-            diverged,
-            0.0,
-            info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"],
-        )
+        info |= conditions | {"termination": TERMINATIONS[rule], "time_to_reach": self._reach_time}
+        reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
+        reward = np.where(diverged, 0.0, reward)
         return self._observe(state), reward, (rule > 0) & ~truncated, truncated, info
 
     def _simulate(self, command: np.ndarray) -> np.ndarray:
@@ -601,6 +591,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load / self._servo_kp
         self._diameter[ids] = diameter
         self._decisions[ids] = 0
+        self._reach_time = self._reach_time.copy()  # earlier infos keep theirs
         self._reach_time[ids] = np.inf
 
     def _state(self) -> CraneState:
@@ -620,7 +611,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """Observations (N, 18), float32, inside the observation space."""
         delta_p, _, angle = relative_pose(state, self.offset, self.signed_yaw)
         if self.pose_noise != "none":
-            epsilon = self._noise[np.arange(self.num_envs), self._decisions]
+            now = np.minimum(self._decisions, self.max_decisions)
+            epsilon = self._noise[np.arange(self.num_envs), now]
             delta_p, angle = noisy_pose(delta_p, angle, epsilon)
         obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
         space = self.single_observation_space

@@ -1,6 +1,6 @@
 """How cheap may MuJoCo's search for SDF contacts be? One policy, 120 trials, several settings.
 
-A setting agrees with MuJoCo's default (40 starting points, 10 iterations) in a trial when both succeed
+A setting agrees with MuJoCo's default (40 starts, 10 iterations) in a trial when both succeed
 or both fail. Writes benchmark/sdf_search.csv.
 
     python benchmark/sdf_search.py [policy.pt]

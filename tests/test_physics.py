@@ -347,6 +347,13 @@ def test_fuzz_primitive(speed, autoreset):
     assert diverged == 0 and warnings == 0
 
 
+@pytest.mark.parametrize("integrator, solver", [("implicit", "CG"), ("discrete", "Newton")])
+def test_fuzz_other_integrators(integrator, solver):
+    envs = CraneVectorEnv(64, integrator=integrator, solver=solver)
+    diverged, warnings, _ = fuzz(envs, 100_000, 7, True)
+    assert diverged == 0 and warnings == 0
+
+
 def test_fuzz_sdf():
     diverged, warnings, done = fuzz(CraneVectorEnv(16, contact="sdf"), 50_000, 6, True)
     assert done > 45_000

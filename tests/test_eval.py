@@ -1,0 +1,120 @@
+"""The judge: intervals, tables, JSON, files, errors, and that trials are what they claim."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import crane_env
+import eval_crane
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*arguments, cwd=ROOT):
+    command = [sys.executable, str(ROOT / "eval_crane.py"), *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+
+
+def test_wilson_interval():
+    # by hand: p = 0.96, n = 100, z = 1.959964
+    low, high = eval_crane.wilson_interval(96, 100)
+    assert low == pytest.approx(0.9016, abs=1e-4) and high == pytest.approx(0.9843, abs=1e-4)
+    assert eval_crane.wilson_interval(0, 10) == (0.0, pytest.approx(0.2775, abs=1e-4))
+    assert eval_crane.wilson_interval(10, 10)[1] == 1.0
+
+
+def test_first_unmet_condition_is_the_failure():
+    info = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, "termination": "time_limit"}
+    info |= {"not_reached": False, "not_lifted": False, "not_held": True, "off_centre": True}
+    assert eval_crane.trial_record(0.5, info)["failure"] == "not_held"
+    assert (
+        eval_crane.trial_record(0.5, {**info, "termination": "overspeed"})["failure"] == "overspeed"
+    )
+    good = {**info, "success": True, "not_held": False, "off_centre": False}
+    assert eval_crane.trial_record(0.5, good)["failure"] == ""
+
+
+def test_json_and_csv(tmp_path):
+    file = tmp_path / "trials.csv"
+    arguments = ["--policy", "zero", "--trials", "2", "--diameters", "0.4", "0.8", "--seed", "5"]
+    result = run(*arguments, "--json", "--csv", file)
+    assert result.returncode == 0, result.stderr
+    answer = json.loads(result.stdout)  # standard output holds nothing else
+    assert answer["policy"] == "zero" and answer["seed"] == 5
+    assert answer["contact"] == "primitive" and answer["pose_noise"] == "none"
+    assert [cell["diameter"] for cell in answer["cells"]] == [0.4, 0.8]
+    for cell in answer["cells"]:
+        assert cell["trials"] == 2 and cell["successes"] == 0 and cell["success_rate"] == 0
+        assert cell["failures"] == {"not_reached": 2}
+        assert cell["interval"][0] == 0 and 0.6 < cell["interval"][1] < 0.7
+    assert answer["mean_success_rate"] == 0
+    rows = list(csv.DictReader(file.open()))
+    assert len(rows) == 4 and rows[0]["failure"] == "not_reached"
+
+
+def test_both_tables_unless_noise_is_given():
+    both = run("--policy", "random", "--trials", "1")
+    assert both.returncode == 0, both.stderr
+    assert "Table I, clean" in both.stdout and "Table II, pose noise" in both.stdout
+    assert "| 94 " in both.stdout and "| 88 " in both.stdout and "96.3" in both.stdout
+    one = run("--policy", "random", "--trials", "1", "--pose-noise", "episode")
+    assert one.stdout.count("| mean") == 1
+
+
+def test_shipped_policy_lifts_logs():
+    result = run("--json", "--trials", "4", "--diameters", "0.4", "0.6", "--seed", "77")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["mean_success_rate"] >= 0.75
+
+
+def test_same_trial_in_any_batch(monkeypatch):
+    """A trial's outcome does not depend on which trials are simulated beside it."""
+    make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic=False)
+    diameters, seeds = crane_env.monte_carlo_trials(3, 4, (0.3, 0.7))
+    together = eval_crane.run_trials(make_act, kwargs, diameters, seeds)
+    monkeypatch.setattr(eval_crane, "CRANES", 3)
+    assert eval_crane.run_trials(make_act, kwargs, diameters, seeds) == together
+
+
+def test_video(tmp_path):
+    try:
+        crane_env.mujoco.Renderer(crane_env.load_model(), 8, 8).close()
+    except Exception as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    film = tmp_path / "film.mp4"
+    # an idle crane fails after 6 s: 120 frames
+    result = run("--policy", "zero", "--diameters", "0.5", "--video", film)
+    assert result.returncode == 0, result.stderr
+    import imageio
+
+    frames = imageio.mimread(film, memtest=False)
+    assert len(frames) == 120 and frames[0].shape == (720, 1280, 3)
+    assert np.std(frames[0]) > 10
+
+
+def test_clear_errors(tmp_path):
+    def error_of(*arguments):
+        result = run(*arguments)
+        assert result.returncode != 0 and "Traceback" not in result.stderr
+        return result.stderr
+
+    assert "no file nowhere.pt" in error_of("nowhere.pt")
+    (tmp_path / "junk.pt").write_bytes(b"junk")
+    assert "is no policy.pt of this repository" in error_of(tmp_path / "junk.pt")
+    saved = torch.load(eval_crane.SHIPPED, weights_only=True)
+    torch.save({**saved, "algorithm": "sac"}, tmp_path / "sac.pt")
+    assert "unknown algorithm 'sac'; known: mppo_beta" in error_of(tmp_path / "sac.pt")
+    args = {**saved["args"], "hidden_sizes": (8, 8)}
+    torch.save({**saved, "args": args}, tmp_path / "shape.pt")
+    assert "weights do not fit" in error_of(tmp_path / "shape.pt")
+    args = {**saved["args"], "env_id": "Pendulum-v1"}
+    torch.save({**saved, "args": args}, tmp_path / "pendulum.pt")
+    assert "trained on Pendulum-v1" in error_of(tmp_path / "pendulum.pt")
+    assert "must lie in [0.3, 0.8]" in error_of("--diameters", "0.2", "--policy", "zero")
+    assert "--trials must be at least 1" in error_of("--trials", "0")
