@@ -45,6 +45,7 @@ direction. 0 stops the joint; values outside the box are clipped.
 | 5     | q8 jaws          | 1    | -1  | 1    | -1.8, 1.8 rad/s           | -3, 3         |
 """
 
+import ctypes.util
 import os
 import sys
 from collections.abc import Sequence
@@ -52,7 +53,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before mujoco is imported
+    # To render without a display; before mujoco is imported, which fails where EGL is missing.
+    if ctypes.util.find_library("EGL"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
 
 import gymnasium
 import mujoco
@@ -372,7 +375,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         width: int = 640,
         height: int = 480,
     ):
-        for name, value in {"num_envs": num_envs, "frame_skip": frame_skip}.items():
+        counts = {"num_envs": num_envs, "frame_skip": frame_skip}
+        counts |= {"sdf_initpoints": sdf_initpoints, "sdf_iterations": sdf_iterations}
+        for name, value in counts.items():
             if int(value) != value or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value}")
         _choice("reward", reward, ("staged", "paper"))
@@ -380,6 +385,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         _choice("offset", offset, ("minus", "plus"))
         _choice("pose_noise", pose_noise, ("none", "step", "episode"))
         _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        _choice("camera", camera, ("overview", "side", "grapple"))
         self.num_envs, self.frame_skip = int(num_envs), int(frame_skip)
         self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
         self.speed, self.pose_noise = SPEEDS[speed], pose_noise
@@ -387,7 +393,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.difficulty = difficulty
         self.fixed_diameter = None
         if diameter is not None:
-            self.fixed_diameter = np.broadcast_to(np.asarray(diameter, float), (num_envs,))
+            if np.shape(diameter) not in [(), (self.num_envs,)]:
+                raise ValueError(f"diameter must be one number or {self.num_envs} numbers")
+            self.fixed_diameter = np.broadcast_to(np.asarray(diameter, float), self.num_envs)
             if not np.all((D_MIN <= self.fixed_diameter) & (self.fixed_diameter <= D_MAX)):
                 raise ValueError(f"diameter must lie in [{D_MIN}, {D_MAX}] m, got {diameter}")
 
@@ -648,11 +656,18 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def _show(self) -> None:
         import mujoco.viewer
 
-        self._scene_model = self.batch.get_model(0, self._scene_model)
-        self._scene_data = self.batch.get_data(0, self._scene_data)
         if self._viewer is None:
+            self._scene_model, self._scene_data = self.batch.get_model(0), self.batch.get_data(0)
             self._viewer = mujoco.viewer.launch_passive(self._scene_model, self._scene_data)
+        with self._viewer.lock():
+            self.batch.get_model(0, self._scene_model)
+            self.batch.get_data(0, self._scene_data)
         self._viewer.sync()
+
+    @property
+    def window_closed(self) -> bool:
+        """Whether the user has closed the "human" window."""
+        return self._viewer is not None and not self._viewer.is_running()
 
     def close_extras(self, **kwargs: Any) -> None:
         if self._renderer is not None:

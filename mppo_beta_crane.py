@@ -40,6 +40,7 @@ from tqdm import trange
 import crane_env
 
 ALGORITHM = "mppo_beta"
+MACHINE_ARGS = ("resume", "device", "torch_threads", "env_threads")  # not taken from a checkpoint
 # alpha, beta < 1 + e^3.5: at this bound a Beta about 1/2 is as wide as the default perturbation
 # (standard deviation 0.06); a narrower one takes its perturbed samples for outliers.
 MAX_LOG_EXCESS = 3.5
@@ -54,7 +55,7 @@ class Args:
     total_timesteps: int = 2_457_600  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
-    resume: str | None = None  # checkpoint.pt to go on from; it also sets all other arguments
+    resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
     # --- environment
@@ -194,6 +195,12 @@ def shift_mean(distribution: Beta, shift: torch.Tensor) -> Beta:
     return Beta(moved, concentration - moved, validate_args=False)
 
 
+def perturb_actions(actions: torch.Tensor, epsilon: float) -> torch.Tensor:
+    """Eq. (robust ppo): clip(a_n + g, 0, 1), g ~ U(-epsilon, epsilon); A_MIN off the ends."""
+    noise = torch.empty_like(actions).uniform_(-1, 1) * epsilon
+    return (actions + noise).clamp(A_MIN, 1 - A_MIN)
+
+
 def compute_gae(
     rewards: torch.Tensor,
     values: torch.Tensor,
@@ -269,15 +276,22 @@ if __name__ == "__main__":
     if args.resume is not None:
         if not Path(args.resume).is_file():
             raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
-        checkpoint = torch.load(args.resume, map_location=args.device, weights_only=True)
-        if checkpoint.get("algorithm") != ALGORITHM or "optimizer" not in checkpoint:
+        try:
+            checkpoint = torch.load(args.resume, map_location=args.device, weights_only=True)
+            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
+        except Exception:
+            ours = False
+        if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        args = Args(**{**checkpoint["args"], "resume": args.resume})
+        machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+        args = Args(**{**checkpoint["args"], **machine})
     elif args.paper:
         print(PAPER_GUESSES)
     batch_size = args.num_envs * args.num_steps
     num_minibatches = -(-batch_size // args.minibatch_size)
     num_iterations = max(1, args.total_timesteps // batch_size)
+    if batch_size % args.minibatch_size == 1:
+        raise SystemExit("--minibatch-size leaves one sample over, which has no standard deviation")
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
     gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
@@ -293,10 +307,11 @@ if __name__ == "__main__":
     except (gymnasium.error.Error, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    if not all(
-        isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in (obs_space, action_space)
-    ):
+    spaces = (obs_space, action_space)
+    if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
         raise SystemExit(f"--env-id: {args.env_id} has no flat Box observations and actions")
+    if not action_space.is_bounded():
+        raise SystemExit(f"--env-id: {args.env_id} has unbounded actions, and a Beta needs bounds")
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
 
@@ -323,6 +338,7 @@ if __name__ == "__main__":
             "weights": agent.state_dict(),
             "global_step": iteration * batch_size,
         }
+        writer.flush()
         save_atomically(policy, run_dir / "policy.pt")
         state = {
             "optimizer": optimizer.state_dict(),
@@ -346,10 +362,10 @@ if __name__ == "__main__":
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
     episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
     recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
-    start_time, start_iteration = time.time(), first_iteration
+    start_time = time.time()
 
-    iteration = first_iteration - 1
-    progress = trange(first_iteration, num_iterations + 1, initial=iteration, total=num_iterations)
+    completed = first_iteration - 1
+    progress = trange(first_iteration, num_iterations + 1, initial=completed, total=num_iterations)
     try:
         for iteration in progress:
             # ---- rollout: the actor alone; values and log-probabilities follow in one batch
@@ -365,12 +381,8 @@ if __name__ == "__main__":
                 obs[step] = next_obs
                 with torch.no_grad():
                     action = agent.get_distribution(next_obs).sample()
-                    if args.perturb == "action":
-                        noise = torch.empty_like(action).uniform_(
-                            -args.perturbation, args.perturbation
-                        )
-                        action = action + noise
-                    actions[step] = action.clamp(A_MIN, 1 - A_MIN)
+                    epsilon = args.perturbation if args.perturb == "action" else 0.0
+                    actions[step] = perturb_actions(action, epsilon)
                     env_actions = agent.to_env(actions[step]).cpu().numpy()
                 next_obs, reward, terminated, truncated, info = envs.step(env_actions)
                 next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
@@ -467,10 +479,11 @@ if __name__ == "__main__":
                 stats["losses/explained_variance"] = [(1 - residual_var / b_returns.var()).item()]
                 # only now, so that rollout and update have seen the same policy
                 agent.update_normalizer(b_obs)
+            completed = iteration
 
             # ---- reports
             now = time.time()
-            sps = (iteration - start_iteration + 1) * batch_size / (now - start_time)
+            sps = (iteration - first_iteration + 1) * batch_size / (now - start_time)
             report = {name: np.mean(values) for name, values in stats.items()}
             report["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
             report["charts/updates"] = iteration
@@ -489,7 +502,8 @@ if __name__ == "__main__":
                     for name in crane_env.TERMINATIONS[1:]:
                         share = np.mean(np.array(ended["termination"]) == name)
                         report[f"termination/{name}"] = share
-                    if args.curriculum and np.mean(recent_success) > 0.7:
+                    full = len(recent_success) == recent_success.maxlen
+                    if args.curriculum and full and np.mean(recent_success) > 0.5:
                         difficulty = min(1.0, difficulty + 0.05)
                         envs.unwrapped.difficulty = difficulty
                         recent_success.clear()
@@ -507,16 +521,17 @@ if __name__ == "__main__":
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")
             if iteration % 10 == 0 or last:
                 save(iteration)
+        progress.close()
+        if args.final_trials:
+            for name, value in evaluate(agent, args, args.final_trials).items():
+                name = name.replace("eval/", "final/")
+                writer.add_scalar(name, value, num_iterations * batch_size)
+                print(f"{name}: {value:.3f}")
     except KeyboardInterrupt:
-        save(iteration - 1)
-        print(f"\ninterrupted; go on with --resume {run_dir / 'checkpoint.pt'}")
+        save(completed)
+        progress.close()
+        print(f"interrupted; go on with --resume {run_dir / 'checkpoint.pt'}")
         raise SystemExit(130) from None
-    progress.close()
-
-    if args.final_trials:
-        for name, value in evaluate(agent, args, args.final_trials).items():
-            writer.add_scalar(name.replace("eval/", "final/"), value, num_iterations * batch_size)
-            print(f"{name.replace('eval/', 'final ')}: {value:.3f}")
     writer.close()
     envs.close()
     print(f"policy saved to {run_dir / 'policy.pt'}")

@@ -1,0 +1,45 @@
+"""Draw benchmark/curves/*.csv into assets/figures/learning_curves.png.
+
+python benchmark/plot_curves.py
+"""
+
+import csv
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+HERE = Path(__file__).parent
+
+
+def column(rows: list[dict], x: str, y: str, scale: float) -> tuple[list[float], list[float]]:
+    """Points of the rows in which y was recorded."""
+    rows = [row for row in rows if row[y]]
+    return [float(row[x]) * scale for row in rows], [100 * float(row[y]) for row in rows]
+
+
+if __name__ == "__main__":
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
+    for k, path in enumerate(sorted((HERE / "curves").glob("*.csv"))):
+        with open(path) as file:
+            rows = list(csv.DictReader(file))
+        color = f"C{k}"
+        for axis, x, scale in ((left, "decisions", 1e-6), (right, "wall_time_s", 1 / 60)):
+            training = column(rows, x, "training_success_rate", scale)
+            axis.plot(*training, color=color, alpha=0.35, linewidth=1)
+            axis.plot(
+                *column(rows, x, "eval_success_rate", scale), ".-", color=color, label=path.stem
+            )
+    left.set_xlabel("decisions [million]")
+    right.set_xlabel("wall clock [min]")
+    left.set_ylabel("success [%]")
+    left.legend(
+        fontsize=7, loc="lower right", title="thick: mean action, thin: training", title_fontsize=7
+    )
+    for axis in (left, right):
+        axis.grid(alpha=0.3)
+        axis.set_ylim(0, 100)
+    figure.tight_layout()
+    figure.savefig(HERE.parent / "assets" / "figures" / "learning_curves.png", dpi=130)
