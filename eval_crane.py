@@ -197,7 +197,8 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
         )
     wins, trials = sum(c["successes"] for c in cells), sum(c["trials"] for c in cells)
     low, high = (100 * bound for bound in wilson_interval(wins, trials))
-    paper = f"{np.mean(list(PAPER[noise].values())):.1f}" if noise in PAPER else ""
+    published = [PAPER.get(noise, {}).get(cell["diameter"]) for cell in cells]
+    paper = "" if None in published else f"{np.mean(published):.1f}"
     print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
     print(
         "Reach (first d_combine < 0.35 m) and miss (grip to log centre) are means of the successes."
@@ -205,7 +206,7 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
 
 
 def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
-    """One trial per diameter, 20 frames a second; the policy decides as often as in training."""
+    """One trial per diameter. At 10 decisions a second, a frame is also taken between decisions."""
     skip = kwargs.pop("frame_skip", 20)
     substeps = 2 if skip % 20 == 0 else 1
     frame_every = max(1, round(10 / (skip // substeps)))
@@ -225,7 +226,8 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
                 frames[i].append(envs.render_crane(i, args.camera))
         ended |= terminated | truncated
     fps = round(1 / (frame_every * envs.dt))
-    with imageio.get_writer(args.video, fps=fps) as video:
+    options = {"duration": 1000 / fps, "loop": 0} if args.video.suffix == ".gif" else {"fps": fps}
+    with imageio.get_writer(args.video, **options) as video:
         for frame in (frame for trial in frames for frame in trial):
             video.append_data(frame)
     envs.close()
@@ -233,12 +235,12 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
 
 
 def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
-    """Trials in a window, in real time, until Ctrl-C."""
+    """Trials in a window, in real time, until it is closed; diameters are drawn."""
     envs = CraneVectorEnv(1, render_mode="human", **kwargs)
     try:
         obs, _ = envs.reset(seed=args.seed)
         act = make_act()
-        while True:
+        while not envs.window_closed:
             start = time.time()
             obs, _, terminated, truncated, info = envs.step(act(obs))
             envs.render()
@@ -247,7 +249,8 @@ def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
                 act = make_act()
             time.sleep(max(0.0, envs.dt - (time.time() - start)))
     except KeyboardInterrupt:
-        envs.close()
+        pass
+    envs.close()
 
 
 def main() -> None:
@@ -262,6 +265,7 @@ def main() -> None:
     else:
         make_act, kwargs, name = fixed_policy(args.policy, args.seed)
         source = args.policy
+    torch.manual_seed(args.seed)
     torch.set_num_threads(1)  # small batches: more threads only wait for each other
     kwargs |= {"contact": args.contact, "env_threads": args.env_threads}
     if args.video or args.viewer:

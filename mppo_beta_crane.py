@@ -52,7 +52,7 @@ class Args:
     # --- experiment
     exp_name: str = "mppo_beta_crane"  # name of the run's folder
     seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 2_457_600  # decisions to train for, over all cranes
+    total_timesteps: int = 1_966_080  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
@@ -70,9 +70,8 @@ class Args:
     offset: Literal["minus", "plus"] = "minus"  # sign of the diameter's part in Delta_p,z
     signed_yaw: bool = False  # observe the signed angle to the log instead of Delta_psi
     pose_noise: Literal["none", "step", "episode"] = "none"  # error of the observed log pose
-    integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = (
-        "implicitfast"  # MuJoCo's
-    )
+    integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
+    """MuJoCo integrator"""
     solver: Literal["Newton", "CG"] = "Newton"  # MuJoCo constraint solver
     curriculum: bool = False  # raise the task's difficulty from 0 to 1 with the success rate
 
@@ -91,9 +90,8 @@ class Args:
     ent_coef: float = 0.0  # c_e, weight of the entropy
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
-    perturb: Literal["action", "none", "rpo"] = (
-        "action"  # what eps moves: a_n as in Eq. (robust ppo); rpo: the mean
-    )
+    perturb: Literal["action", "none", "rpo"] = "action"
+    """what eps moves: action, a_n as in Eq. (robust ppo); rpo, the mean, in the update only"""
     perturbation: float = 0.1  # eps, half width of the perturbation of a_n
 
     # --- reports
@@ -121,8 +119,10 @@ PAPER = Args(
     update_epochs=30,
     target_kl=None,
 )
-PAPER_GUESSES = """Paper's protocol. Guessed, for it does not say: gamma, lambda, clip range,
-minibatch size, weights of value loss and entropy, omega 1-3, z_l,d, speed limits, starts."""
+PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
+lambda, clip range, minibatch size, reward scale, weights of value loss and entropy, gradient bound,
+tanh units, no annealing, normalised observations and advantages, bounds of alpha, beta and a_n,
+omega 1-3 = 1, z_l,d = 1 m, speed limits "real", start of an episode, its length (9 s, not 15 s)."""
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -201,6 +201,20 @@ def perturb_actions(actions: torch.Tensor, epsilon: float) -> torch.Tensor:
     return (actions + noise).clamp(A_MIN, 1 - A_MIN)
 
 
+def bootstrap_values(
+    values: torch.Tensor,
+    last_value: torch.Tensor,
+    terminations: torch.Tensor,
+    cut_at: list[tuple[int, int]],
+    cut_values: torch.Tensor | None,
+) -> torch.Tensor:
+    """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
+    next_values = torch.cat([values[1:], last_value[None]])
+    for (step, i), value in zip(cut_at, cut_values if cut_at else []):
+        next_values[step, i] = value
+    return next_values * (1 - terminations)
+
+
 def compute_gae(
     rewards: torch.Tensor,
     values: torch.Tensor,
@@ -209,7 +223,7 @@ def compute_gae(
     gamma: float,
     gae_lambda: float,
 ) -> torch.Tensor:
-    """Advantages (T, N). next_values (T, N): V(s_{t+1}), at truncation V(final_obs), else 0."""
+    """Advantages (T, N) from rewards, values, `bootstrap_values` and episode ends, all (T, N)."""
     advantages = torch.zeros_like(rewards)
     last = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
@@ -376,7 +390,7 @@ if __name__ == "__main__":
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
-            final_steps, final_cranes, final_obs = [], [], []
+            cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
             for step in range(args.num_steps):
                 obs[step] = next_obs
                 with torch.no_grad():
@@ -395,9 +409,8 @@ if __name__ == "__main__":
                 episodic_length += 1
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
-                        final_steps.append(step)
-                        final_cranes.append(i)
-                        final_obs.append(info["final_obs"][i])
+                        cut_at.append((step, i))
+                        cut_obs.append(info["final_obs"][i].astype(np.float32))
                     ended["return"].append(episodic_return[i])
                     ended["length"].append(episodic_length[i])
                     if is_crane(args):
@@ -417,13 +430,10 @@ if __name__ == "__main__":
                 b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
                 values = agent.get_value(b_obs).view_as(rewards)
                 b_logprobs = agent.get_distribution(b_obs).log_prob(b_actions).sum(-1)
-                next_values = torch.cat([values[1:], agent.get_value(next_obs)[None]])
-                next_values = next_values * (1 - terminations)
-                if final_obs:
-                    last_obs = torch.as_tensor(
-                        np.stack(final_obs), dtype=torch.float32, device=device
-                    )
-                    next_values[final_steps, final_cranes] = agent.get_value(last_obs)
+                last_value, cut_values = agent.get_value(next_obs), None
+                if cut_at:
+                    cut_values = agent.get_value(torch.as_tensor(np.stack(cut_obs), device=device))
+                next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
                 advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
                 returns = advantages + values
             b_advantages, b_returns = advantages.flatten(), returns.flatten()

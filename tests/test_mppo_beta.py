@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -58,6 +59,29 @@ def test_gae_with_a_termination_and_a_truncation():
     torch.testing.assert_close(advantages, torch.tensor([[0.75], [1.0], [3.0], [5.0]]))
 
 
+def test_bootstrap_values():
+    values = torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]])
+    last_value = torch.tensor([4.0, 40.0])
+    terminations = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    cut_at, cut_values = [(0, 1), (2, 0)], torch.tensor([-7.0, -8.0])
+    expected = torch.tensor([[2.0, -7.0], [0.0, 30.0], [-8.0, 0.0]])
+    result = mppo_beta_crane.bootstrap_values(values, last_value, terminations, cut_at, cut_values)
+    torch.testing.assert_close(result, expected)
+    result = mppo_beta_crane.bootstrap_values(values, last_value, 0 * terminations, [], None)
+    torch.testing.assert_close(result, torch.cat([values[1:], last_value[None]]))
+
+
+def test_perturbed_actions():
+    torch.manual_seed(0)
+    middle = torch.full((20_000,), 0.5)
+    noise = mppo_beta_crane.perturb_actions(middle, 0.1) - middle
+    assert noise.min() >= -0.1 and noise.max() <= 0.1 and abs(noise.mean()) < 2e-3
+    assert noise.std().item() == pytest.approx(0.2 / math.sqrt(12), rel=0.02)
+    ends = mppo_beta_crane.perturb_actions(torch.tensor([0.0, 1.0] * 50), 0.1)
+    assert ends.min() >= A_MIN and ends.max() <= 1 - A_MIN
+    assert torch.equal(mppo_beta_crane.perturb_actions(middle, 0.0), middle)
+
+
 def test_gae_without_ends_is_the_discounted_sum_of_deltas():
     torch.manual_seed(0)
     rewards, values = torch.randn(6, 3), torch.randn(7, 3)
@@ -68,24 +92,42 @@ def test_gae_without_ends_is_the_discounted_sum_of_deltas():
 
 
 def test_alpha_and_beta_exceed_one_even_for_absurd_observations():
-    distribution = make_agent().get_distribution(1e6 * torch.randn(64, 18))
-    assert distribution.concentration1.min() > 1 and distribution.concentration0.min() > 1
+    agent = make_agent()
+    with torch.no_grad():
+        agent.actor[-1].weight.mul_(1e6)
+    distribution = agent.get_distribution(1e6 * torch.randn(64, 18))
+    for concentration in (distribution.concentration1, distribution.concentration0):
+        assert concentration.min() > 1 and concentration.max() <= 1 + math.exp(3.5) + 1e-3
+        assert concentration.max() > 30
+
+
+def set_head(agent, alpha_outputs, beta_outputs):
+    """Make the actor's outputs these, whatever it observes."""
+    with torch.no_grad():
+        agent.actor[-1].weight.zero_()
+        agent.actor[-1].bias[:6], agent.actor[-1].bias[6:] = alpha_outputs, beta_outputs
 
 
 def test_log_probability_is_finite_at_the_clamps():
     agent = make_agent()
-    for bound in (A_MIN, 1 - A_MIN):
-        logprob = agent.get_distribution(torch.randn(64, 18)).log_prob(torch.full((64, 6), bound))
-        assert torch.isfinite(logprob).all()
-    # a narrow Beta far from the bound: a small number, not an infinity that would ruin the update
-    assert Beta(40.0, 1.5).log_prob(torch.tensor(A_MIN)) > -400
+    for alpha, beta in [(0.0, 0.0), (50.0, -50.0), (-50.0, 50.0), (50.0, 50.0)]:
+        set_head(agent, alpha, beta)
+        for bound in (A_MIN, 1 - A_MIN):
+            logprob = agent.get_distribution(torch.zeros(1, 18)).log_prob(torch.full((1, 6), bound))
+            assert torch.isfinite(logprob).all() and logprob.abs().max() < 350
 
 
 def test_log_probability_is_the_beta_density():
-    alpha, beta, a = 2.0, 3.0, 0.3
-    density = math.gamma(5) / (math.gamma(2) * math.gamma(3)) * a * (1 - a) ** 2
-    logprob = Beta(torch.tensor(alpha), torch.tensor(beta)).log_prob(torch.tensor(a))
-    assert logprob.item() == pytest.approx(math.log(density), rel=1e-5)
+    agent = make_agent()
+    set_head(agent, 1.0, -0.5)  # alpha = 1 + exp(3.5 tanh(1 / 3.5)), beta likewise
+    alpha = 1 + math.exp(3.5 * math.tanh(1 / 3.5))
+    beta = 1 + math.exp(3.5 * math.tanh(-0.5 / 3.5))
+    a = 0.3
+    normalizer = math.gamma(alpha + beta) / (math.gamma(alpha) * math.gamma(beta))
+    expected = 6 * math.log(normalizer * a ** (alpha - 1) * (1 - a) ** (beta - 1))
+    distribution = agent.get_distribution(torch.zeros(1, 18))
+    logprob = distribution.log_prob(torch.full((1, 6), a)).sum(-1)
+    assert logprob.item() == pytest.approx(expected, rel=1e-4)
 
 
 def test_mean_action_on_the_admissible_range():
@@ -217,12 +259,19 @@ def test_killed_run_goes_on(tmp_path):
 
 def test_ctrl_c_leaves_both_files(tmp_path):
     process = start(tmp_path, "--total-timesteps", "640000")
+    for file in only_run(tmp_path).glob("*.pt"):
+        file.unlink()  # what is there afterwards was written on the way out
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors[-2000:]
     names = {p.name for p in only_run(tmp_path).glob("*.pt")}
     assert names == {"checkpoint.pt", "policy.pt"}
-    torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)
+    checkpoint = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)
+    assert (
+        checkpoint["iteration"] >= 10 and checkpoint["global_step"] == checkpoint["iteration"] * 64
+    )
+    updates = {s["step"].item() for s in checkpoint["optimizer"]["state"].values()}
+    assert 4 * checkpoint["iteration"] <= max(updates) <= 4 * checkpoint["iteration"] + 4
 
 
 def test_clear_errors(tmp_path):
@@ -245,3 +294,5 @@ def test_help_explains_every_argument(tmp_path):
     text = run(tmp_path, "--help").stdout
     for name in Args.__dataclass_fields__:
         assert "--" + name.replace("_", "-") in text, name
+    assert len(re.findall(r"\(default:", " ".join(text.split()))) == len(Args.__dataclass_fields__)
+    assert "MuJoCo integrator" in text and "what eps moves" in text

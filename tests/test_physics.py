@@ -182,16 +182,15 @@ def test_small_swing_is_that_of_a_damped_compound_pendulum(joint):
     assert abs(period / expected - 1) < 0.02
 
 
-@pytest.mark.parametrize("speed", ["real"])
-def test_each_servo_settles_on_its_command(speed):
+def test_each_servo_settles_on_its_command():
     """Within 2 % of its limit, both directions, both stages and jaws."""
     q = np.tile(HANGING, (12, 1))
     q[:, 1], q[:, 4] = 0.9, np.pi / 2 - 1.1  # high above the ground
-    envs = place(q, speed=speed)
+    envs = place(q)
     actions = np.zeros((12, 6))
     for i in range(6):
         actions[2 * i, i], actions[2 * i + 1, i] = 1.0, -1.0
-    low, high = crane_env.SPEEDS[speed]
+    low, high = crane_env.SPEEDS["real"]
     command = np.where(actions < 0, -actions * low, actions * high)[:, COMMAND_OF_SERVO]
     for _ in range(5):
         envs.advance(actions)
@@ -217,7 +216,9 @@ def test_idle_crane_stays():
     for _ in range(90):
         envs.advance(np.zeros((16, 6)))
     drift = np.abs(envs._state().q - before)[:, crane_env.ACTUATED]
-    assert drift.max() < 5e-4  # at 11 m reach 5e-4 rad are 5 mm
+    tips = [np.stack(crane_env.tip_position(*q[:, 1:4].T)) for q in (before, envs._state().q)]
+    assert np.abs(tips[0] - tips[1]).max() < 5e-3
+    assert drift.max() < 2e-4
 
     envs = place(HANGING)
     for _ in range(600):
@@ -317,7 +318,7 @@ def fuzz(envs, steps, seed, autoreset):
     bang = np.ones((n, 6))
     q, log_pose = grasp_start()
     diameter = rng.uniform(0.3, 0.8, n)
-    diverged = 0
+    diverged, held = 0, np.zeros(n, bool)
     decisions = steps // (n * envs.frame_skip)
     for k in range(decisions):
         if k % 60 == 0:  # a third of the cranes start over a log and grip it
@@ -329,11 +330,14 @@ def fuzz(envs, steps, seed, autoreset):
         bang = np.where(rng.random((n, 6)) < 0.1, -bang, bang)
         actions = np.where(rng.random((n, 1)) < 0.5, bang, rng.uniform(-1, 1, (n, 6)))
         actions[gripping, 5] = 1.0
-        if k % 60 > 20:  # then it swings the log about
+        if k % 60 <= 20:
+            actions[gripping, :5] = 0.0
+        else:  # then it swings the log about
             actions[gripping, 1] = np.abs(actions[gripping, 1])
         info = (envs.step if autoreset else envs.advance)(actions)[-1]
         diverged += (info["termination"] == "diverged").sum()
-    assert np.isfinite(envs._qpos).all()
+        held |= (info["clearance"] > 0.1) & ~info["not_lifted"]
+    assert np.isfinite(envs._qpos).all() and held.any()
     return diverged, envs.batch.warning[:, :, 1].sum(), decisions * n * envs.frame_skip
 
 
