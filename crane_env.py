@@ -92,8 +92,8 @@ SERVOS = ["q1", "q2", "q3", "q4", "q4_stage2", "q7", "q8", "q8_inner"]
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
 ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
 LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
-TERMINATIONS = np.array(
-    "none not_reached joint_limit log_too_far overspeed diverged time_limit".split()
+TERMINATIONS = np.array(  # the first that applies counts
+    "none diverged joint_limit overspeed log_too_far not_reached time_limit".split()
 )
 
 
@@ -280,16 +280,15 @@ def termination_rule(
     """
     q, (low, high) = state.q[:, LIMITED], joint_range[LIMITED].T
     distance = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
-    rules = {
-        "diverged": diverged,
-        "joint_limit": ((q < low) | (q > high)).any(axis=-1),
-        "overspeed": ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
-        "log_too_far": distance > LOG_RANGE,
-        "not_reached": ~reached & (time > REACH_TIME - 1e-9),
-        "time_limit": time > TIME_LIMIT - 1e-9,
-    }
-    codes = [np.flatnonzero(TERMINATIONS == name)[0] for name in rules]
-    return np.select(list(rules.values()), codes, default=0)
+    rules = [
+        diverged,
+        ((q < low) | (q > high)).any(axis=-1),
+        ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
+        distance > LOG_RANGE,
+        ~reached & (time > REACH_TIME - 1e-9),
+        time > TIME_LIMIT - 1e-9,
+    ]
+    return np.select(rules, range(1, len(TERMINATIONS)), default=0)
 
 
 def success_conditions(
@@ -390,6 +389,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
         self.speed, self.pose_noise = SPEEDS[speed], pose_noise
         self.omega1, self.omega2, self.omega3 = omega1, omega2, omega3
+        if not 0 <= difficulty <= 1:
+            raise ValueError(f"difficulty must lie in [0, 1], got {difficulty}")
         self.difficulty = difficulty
         self.fixed_diameter = None
         if diameter is not None:
@@ -431,15 +432,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def _bind(self, batch: Batch, model: mujoco.MjModel) -> None:
         """Live views of the engine's arrays, and where in them our joints are."""
-        self._qpos, self._qvel, self._act = (batch.bind(n) for n in ("qpos", "qvel", "act"))
-        self._ctrl, self._sensordata = batch.bind("ctrl"), batch.bind("sensordata")
-        self._qfrc_bias = batch.bind("qfrc_bias")
+        self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
+        self._ctrl, self._sensordata = map(batch.bind, ("ctrl", "sensordata"))
+        self._qfrc_bias, self._geom_size = batch.bind("qfrc_bias"), batch.expand("geom_size")
+        self._body_mass, self._body_inertia = map(batch.expand, ("body_mass", "body_inertia"))
         self._log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
         self._log_body = model.body("log").id
         self._log_qpos = slice(model.joint("log").qposadr[0], model.joint("log").qposadr[0] + 7)
-        self._geom_size = batch.expand("geom_size")
-        self._body_mass = batch.expand("body_mass")
-        self._body_inertia = batch.expand("body_inertia")
         joints = [model.joint(name) for name in JOINTS]
         servos = [model.joint(name) for name in SERVOS]
         self._q = np.array([j.qposadr[0] for j in joints])
@@ -451,16 +450,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._servo_kp = np.array([a.gainprm[0] for a in integral])
         force_limit = model.jnt_actfrcrange[[j.id for j in servos], 1]  # N m, telescopes N
         self._max_lead = force_limit / self._servo_kp
-
-    @property
-    def difficulty(self) -> float:
-        return self._difficulty
-
-    @difficulty.setter
-    def difficulty(self, value: float) -> None:
-        if not 0 <= value <= 1:
-            raise ValueError(f"difficulty must lie in [0, 1], got {value}")
-        self._difficulty = float(value)
 
     def reset(
         self,
@@ -644,24 +633,27 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         elif self.render_mode == "rgb_array":
             return tuple(self.render_crane(i) for i in range(self.num_envs))
 
-    def render_crane(self, i: int, camera: str | None = None) -> np.ndarray:
-        """RGB frame (height, width, 3), uint8, of crane i; cameras: overview, side, grapple."""
+    def _scene(self, i: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Copies of crane i's model and data, always into the same two objects."""
         self._scene_model = self.batch.get_model(i, self._scene_model)
         self._scene_data = self.batch.get_data(i, self._scene_data)
+        return self._scene_model, self._scene_data
+
+    def render_crane(self, i: int, camera: str | None = None) -> np.ndarray:
+        """RGB frame (height, width, 3), uint8, of crane i; cameras: overview, side, grapple."""
+        model, data = self._scene(i)
         if self._renderer is None:
-            self._renderer = mujoco.Renderer(self._scene_model, *self._frame_size)
-        self._renderer.update_scene(self._scene_data, camera or self.camera)
+            self._renderer = mujoco.Renderer(model, *self._frame_size)
+        self._renderer.update_scene(data, camera or self.camera)
         return self._renderer.render()
 
     def _show(self) -> None:
         import mujoco.viewer
 
         if self._viewer is None:
-            self._scene_model, self._scene_data = self.batch.get_model(0), self.batch.get_data(0)
-            self._viewer = mujoco.viewer.launch_passive(self._scene_model, self._scene_data)
+            self._viewer = mujoco.viewer.launch_passive(*self._scene(0))
         with self._viewer.lock():
-            self.batch.get_model(0, self._scene_model)
-            self.batch.get_data(0, self._scene_data)
+            self._scene(0)
         self._viewer.sync()
 
     @property

@@ -68,6 +68,8 @@ class Args:
     """film one trial per diameter into this .mp4 or .gif instead of evaluating"""
     camera: Literal["overview", "side", "grapple"] = "overview"
     """of the video"""
+    width: int = 1280
+    """of the video [pixels], 16:9"""
     viewer: bool = False
     """show one trial after another in a window instead of evaluating"""
 
@@ -212,7 +214,12 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     frame_every = max(1, round(10 / (skip // substeps)))
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     envs = CraneVectorEnv(
-        len(seeds), skip // substeps, diameter=diameters, width=1280, height=720, **kwargs
+        len(seeds),
+        skip // substeps,
+        diameter=diameters,
+        width=args.width,
+        height=args.width * 9 // 16,
+        **kwargs,
     )
     frames: list[list[np.ndarray]] = [[] for _ in seeds]
     obs, _ = envs.reset(seed=seeds)

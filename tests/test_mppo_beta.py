@@ -228,6 +228,37 @@ def test_curriculum_starts_easy(tmp_path):
     assert scalars(only_run(tmp_path))["charts/difficulty"] == [0.0, 0.0]
 
 
+@pytest.mark.parametrize(
+    "variant", [["--contact", "sdf", "--pose-noise", "step"], ["--signed-yaw", "--offset", "plus"]]
+)
+def test_variants_of_the_task_train(tmp_path, variant):
+    run(tmp_path, *SMALL, *variant, "--total-timesteps", "128", "--eval-every", "2")
+    assert len(scalars(only_run(tmp_path))["losses/policy_loss"]) == 2
+
+
+def test_paper_protocol(tmp_path):
+    """Its defaults, under explicit arguments that make two updates short."""
+    small = [
+        "--num-envs",
+        "2",
+        "--num-steps",
+        "20",
+        "--minibatch-size",
+        "20",
+        "--final-trials",
+        "0",
+    ]
+    small += ["--update-epochs", "1", "--eval-every", "0", "--total-timesteps", "80"]
+    result = run(tmp_path, "--paper", *small)
+    assert "guessed" in result.stdout and "estimated hours" in result.stdout + result.stderr
+    args = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)["args"]
+    assert args["hidden_sizes"] == (256, 256, 256, 256) and args["learning_rate"] == 3e-4
+    assert args["frame_skip"] == 1 and args["contact"] == "sdf" and args["reward"] == "paper"
+    assert args["integrator"] == "implicit" and args["solver"] == "CG" and args["num_envs"] == 2
+    assert mppo_beta_crane.PAPER.num_envs == 42 and mppo_beta_crane.PAPER.num_steps == 1000
+    assert mppo_beta_crane.PAPER.update_epochs == 30
+
+
 def start(cwd, *arguments):
     command = [sys.executable, str(SCRIPT), *SMALL, "--eval-every", "0", *arguments]
     process = subprocess.Popen(

@@ -1,6 +1,9 @@
 """The crane against closed forms: kinematics, masses, pendulum, servos, gripping, contacts."""
 
+import importlib.util
 import os
+import subprocess
+import sys
 
 import mujoco
 import numpy as np
@@ -362,3 +365,90 @@ def test_fuzz_sdf():
     diverged, warnings, done = fuzz(CraneVectorEnv(16, contact="sdf"), 50_000, 6, True)
     assert done > 45_000
     assert diverged == 0 and warnings == 0
+
+
+def deepest_contact(envs):
+    """Smallest contact distance (m) of crane links with ground or truck, and which of the two."""
+    model, data = envs.batch.get_model(0), envs.batch.get_data(0)
+    mujoco.mj_forward(model, data)
+    touched, depth = set(), 0.0
+    for contact in data.contact:
+        bits = {int(model.geom_contype[g]) for g in (contact.geom1, contact.geom2)}
+        if 0 in bits and bits & {1, 2} and model.geom("log").id not in contact.geom:
+            touched |= bits & {1, 2}
+            depth = min(depth, contact.dist)
+    return depth, touched
+
+
+@pytest.mark.parametrize("q8", [0.0, 1.6])
+def test_crane_does_not_pass_through_the_ground(q8):
+    q = HANGING.copy()
+    q[7] = q8
+    envs = place(q)
+    touched = set()
+    for _ in range(60):
+        envs.advance(np.array([[0.0, -1.0, 0.0, 1.0, 0.0, 0.0]]))
+        depth, now = deepest_contact(envs)
+        touched |= now
+        assert depth > -0.05
+    assert touched == {1}
+
+
+def test_crane_does_not_pass_through_the_truck():
+    q = HANGING.copy()
+    q[1:5] = [0.5, -0.9, 0.1, np.pi / 2 + 0.4 - 0.01]  # folded: the grapple hangs at 1.2 m
+    q[4] = np.clip(q[4], -np.pi / 2, np.pi / 2)
+    envs = place(q)
+    touched = set()
+    for _ in range(40):  # towards the cab
+        envs.advance(np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+        depth, now = deepest_contact(envs)
+        touched |= now
+        assert depth > -0.08
+    assert 2 in touched
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "implicit", "discrete", "Euler"])
+@pytest.mark.parametrize("solver", ["Newton", "CG"])
+def test_integrators_and_solvers_are_passed_on(integrator, solver):
+    model = CraneVectorEnv(1, integrator=integrator, solver=solver).batch.get_model(0)
+    assert mujoco.mjtIntegrator(model.opt.integrator).name == f"mjINT_{integrator.upper()}"
+    assert mujoco.mjtSolver(model.opt.solver).name == f"mjSOL_{solver.upper()}"
+
+
+def test_both_contact_models_have_one_inertia_and_one_friction():
+    frictions = []
+    for contact, jaw, log in [("primitive", None, "log_capsule"), ("sdf", "jaw_outer_mesh", "log")]:
+        model = load_model(contact)
+        reference = load_model("primitive")
+        np.testing.assert_array_equal(model.body_mass, reference.body_mass)
+        np.testing.assert_array_equal(model.body_inertia, reference.body_inertia)
+        if jaw is None:
+            body = model.body("jaw_outer").id
+            chain = (model.geom_bodyid == body) & (model.geom_conaffinity > 0)
+            friction = model.geom_friction[np.flatnonzero(chain)[0]]
+        else:
+            friction = model.geom(jaw).friction
+        assert model.geom(log).condim[0] == 6
+        frictions.append(np.maximum(friction, model.geom(log).friction))
+    np.testing.assert_array_equal(*frictions)
+
+
+def test_committed_meshes_are_what_the_script_writes(tmp_path):
+    path = crane_env.MODEL_PATH.parent / "make_meshes.py"
+    spec = importlib.util.spec_from_file_location("make_meshes", path)
+    make_meshes = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_meshes)
+    for name, bands in (("outer", make_meshes.OUTER_BANDS), ("inner", make_meshes.INNER_BANDS)):
+        make_meshes.write_jaw(tmp_path / "jaw.obj", bands)
+        committed = (path.parent / f"jaw_{name}.obj").read_text()
+        assert (tmp_path / "jaw.obj").read_text() == committed
+
+
+def test_import_without_opengl():
+    """Training needs no graphics: the module must load where EGL is missing."""
+    code = "import ctypes.util; ctypes.util.find_library = lambda name: None; import crane_env"
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MUJOCO_GL")}
+    command = [sys.executable, "-c", code + "; crane_env.CraneEnv().reset(seed=0)"]
+    root = crane_env.MODEL_PATH.parent.parent
+    subprocess.run(command, cwd=root, env=environment, check=True)
