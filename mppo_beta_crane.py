@@ -52,7 +52,7 @@ class Args:
     # --- experiment
     exp_name: str = "mppo_beta_crane"  # name of the run's folder
     seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 1_966_080  # decisions to train for, over all cranes
+    total_timesteps: int = 1_228_800  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
@@ -78,7 +78,7 @@ class Args:
     # --- algorithm
     num_steps: int = 64  # decisions per crane and rollout
     hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
-    learning_rate: float = 5e-4  # Adam's step size
+    learning_rate: float = 7e-4  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
     gamma: float = 0.99  # discount per 0.1 s; other decision rates rescale it
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s

@@ -203,11 +203,11 @@ def test_each_servo_settles_on_its_command():
 
 
 def test_synchronised_pairs_stay_together():
-    """Within 2 cm and 0.02 rad, through reversals at full speed."""
+    """Within 2 cm and 0.05 rad, through reversals at full speed."""
     envs = place(HANGING)
     for k in range(40):
         envs.advance(np.array([[0.3, 0.2, 0.1, 1.0 if k < 20 else -1.0, 0.0, np.sin(k)]]))
-        for a, b, bound in (("q4", "q4_stage2", 2e-2), ("q8", "q8_inner", 2e-2)):
+        for a, b, bound in (("q4", "q4_stage2", 2e-2), ("q8", "q8_inner", 5e-2)):
             qa, qb = envs.batch.joint(a).qpos, envs.batch.joint(b).qpos
             assert np.abs(qa - qb).max() < bound
 
