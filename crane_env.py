@@ -66,6 +66,7 @@ from mujoco.batch import Batch, SimulationError
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
+ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators
 LOG_LENGTH = 2.75  # m
 LOG_DENSITY = 650.0  # kg/m^3
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
@@ -532,15 +533,17 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def _simulate(self, command: np.ndarray) -> np.ndarray:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
         self._ctrl[:, :8] = self._ctrl[:, 8:] = command
-        # Anti-windup: the integrator leads its joint by no more than the force limit can use. Kept
-        # at zero command, this lead goes on squeezing the log as a hydraulic check valve would.
-        position = self._qpos[:, self._servo_q]
-        self._act[:] = np.clip(self._act, position - self._max_lead, position + self._max_lead)
         failed = np.zeros(self.num_envs, bool)
-        try:
-            self.batch.step(nstep=self.frame_skip, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        except SimulationError as error:
-            failed[error.ids] = True
+        for start in range(0, self.frame_skip, ANTI_WINDUP):
+            # Anti-windup: the integrator leads its joint by no more than the force limit can use.
+            # At zero command this lead goes on squeezing the log as a check valve would.
+            position = self._qpos[:, self._servo_q]
+            self._act[:] = np.clip(self._act, position - self._max_lead, position + self._max_lead)
+            nstep = min(ANTI_WINDUP, self.frame_skip - start)
+            try:
+                self.batch.step(nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)
+            except SimulationError as error:
+                failed[error.ids] = True
         warned = self.batch.warning[:, :, 1].any(axis=-1)
         finite = np.isfinite(self._qpos).all(axis=-1) & np.isfinite(self._qvel).all(axis=-1)
         return failed | warned | ~finite
