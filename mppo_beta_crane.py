@@ -301,6 +301,8 @@ if __name__ == "__main__":
         args = Args(**{**checkpoint["args"], **machine})
     elif args.paper:
         print(PAPER_GUESSES)
+    if min(args.num_envs, args.num_steps, args.minibatch_size) < 1:
+        raise SystemExit("--num-envs, --num-steps and --minibatch-size must be at least 1")
     batch_size = args.num_envs * args.num_steps
     num_minibatches = -(-batch_size // args.minibatch_size)
     num_iterations = max(1, args.total_timesteps // batch_size)

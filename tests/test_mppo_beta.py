@@ -316,7 +316,7 @@ def test_clear_errors(tmp_path):
     result = run(tmp_path, "--env-id", "Pendulum-v77", check=False)
     assert result.returncode == 1 and "Traceback" not in result.stderr
     result = run(tmp_path, "--num-envs", "0", check=False)
-    assert result.returncode == 1 and result.stderr.strip().endswith("at least 1, got 0")
+    assert result.returncode == 1 and result.stderr.strip().endswith("must be at least 1")
     result = run(tmp_path, "--env-id", "CartPole-v1", check=False)
     assert result.returncode == 1 and "no flat Box" in result.stderr
 
