@@ -50,7 +50,7 @@ class Args:
     """trials per log diameter"""
     diameters: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
     """log diameters [m]"""
-    seed: int = 20_000
+    seed: int = 40_000
     """seed of the trials"""
     contact: Literal["primitive", "sdf"] = "primitive"
     """contact model of jaws and log"""
