@@ -194,12 +194,12 @@ def sample_start(
 
 
 def relative_pose(
-    state: CraneState, offset: str = "minus", signed_yaw: bool = False
+    state: CraneState, offset: str = "plus", signed_yaw: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], and what is observed of the angle, (N,).
 
     Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
-    log's diameter d (README, errata); offset "plus" adds d_off instead of subtracting it. The last
+    log's diameter d (README, errata), which offset "plus" adds and "minus" subtracts. The last
     value is Delta_psi, or with signed_yaw the angle from grapple to log, in [-pi/2, pi/2) rad.
     """
     sign = 1.0 if offset == "plus" else -1.0
@@ -249,7 +249,8 @@ def reward_terms(
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
     in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
-    before it, and its r_lift counts twice. Why: README, errata.
+    before it, its r_lift counts twice, and r_balance asks for both jaws on the log. Why: README,
+    errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -262,7 +263,8 @@ def reward_terms(
     else:
         r_grapple = r_distance * closed
         lift = r_distance * np.clip(log_clearance(state), 0, 1)
-        r_lift, r_balance = 2 * lift, calm * lift
+        held = state.touching.all(axis=-1)
+        r_lift, r_balance = 2 * lift, calm * lift * held
     return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
 
 
@@ -357,7 +359,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         contact: str = "primitive",
         reward: str = "staged",
         speed: str = "real",
-        offset: str = "minus",
+        offset: str = "plus",
         signed_yaw: bool = False,
         pose_noise: str = "none",
         diameter: float | np.ndarray | None = None,

@@ -67,7 +67,7 @@ class Args:
     reward: Literal["staged", "paper"] = "staged"  # staged, or as printed in the paper
     omega2: float = 1.0  # sharpness of r_distance [1/m]
     speed: Literal["real", "mjcf"] = "real"  # joint speed limits
-    offset: Literal["minus", "plus"] = "minus"  # sign of the diameter's part in Delta_p,z
+    offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
     signed_yaw: bool = False  # observe the signed angle to the log instead of Delta_psi
     pose_noise: Literal["none", "step", "episode"] = "none"  # error of the observed log pose
     integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
@@ -93,6 +93,7 @@ class Args:
     perturb: Literal["action", "none", "rpo"] = "action"
     """what eps moves: action, a_n as in Eq. (robust ppo); rpo, the mean, in the update only"""
     perturbation: float = 0.1  # eps, half width of the perturbation of a_n
+    anneal_perturbation: bool = True  # lower eps linearly to 0
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
@@ -109,6 +110,7 @@ PAPER = Args(
     frame_skip=1,
     contact="sdf",
     reward="paper",
+    offset="minus",
     integrator="implicit",
     solver="CG",
     num_steps=1000,
@@ -118,6 +120,7 @@ PAPER = Args(
     minibatch_size=2000,
     update_epochs=30,
     target_kl=None,
+    anneal_perturbation=False,
 )
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, clip range, minibatch size, reward scale, weights of value loss and entropy, gradient bound,
@@ -387,9 +390,10 @@ if __name__ == "__main__":
             # ---- rollout: the actor alone; values and log-probabilities follow in one batch
             rollout_start = time.time()
             torch.set_num_threads(1)
+            fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
-                fraction = 1.0 - (iteration - 1.0) / num_iterations
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
+            epsilon = args.perturbation * (fraction if args.anneal_perturbation else 1.0)
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
             cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
@@ -397,8 +401,8 @@ if __name__ == "__main__":
                 obs[step] = next_obs
                 with torch.no_grad():
                     action = agent.get_distribution(next_obs).sample()
-                    epsilon = args.perturbation if args.perturb == "action" else 0.0
-                    actions[step] = perturb_actions(action, epsilon)
+                    noise = epsilon if args.perturb == "action" else 0.0
+                    actions[step] = perturb_actions(action, noise)
                     env_actions = agent.to_env(actions[step]).cpu().numpy()
                 next_obs, reward, terminated, truncated, info = envs.step(env_actions)
                 next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
@@ -447,7 +451,7 @@ if __name__ == "__main__":
                     distribution = agent.get_distribution(b_obs[mb])
                     if args.perturb == "rpo":
                         shift = torch.empty_like(b_actions[mb])
-                        shift.uniform_(-args.perturbation, args.perturbation)
+                        shift.uniform_(-epsilon, epsilon)
                         distribution = shift_mean(distribution, shift)
                     logratio = distribution.log_prob(b_actions[mb]).sum(-1) - b_logprobs[mb]
                     ratio = logratio.exp()

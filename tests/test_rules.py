@@ -27,13 +27,13 @@ def state(**changes):
 
 
 def test_relative_pose():
-    # offset (0.8 - 0.4) / 2 = 0.2: target heights 0.2 - 0.2 = 0 and 0.2 + 0.2 = 0.4
+    # offset (0.8 - 0.4) / 2 = 0.2: target heights 0.2 + 0.2 = 0.4 and 0.2 - 0.2 = 0
     delta_p, delta_psi, observed = crane_env.relative_pose(state())
-    np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.5]])
+    np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.1]])
     np.testing.assert_allclose(delta_psi, [0.2])  # 1 - |0.6 * 0 + 0.8 * 1|
     np.testing.assert_allclose(observed, [0.2])
-    delta_p, _, _ = crane_env.relative_pose(state(), offset="plus")
-    np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.1]])
+    delta_p, _, _ = crane_env.relative_pose(state(), offset="minus")
+    np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.5]])
 
 
 def test_angle_is_that_of_a_line_not_of_an_arrow():
@@ -85,6 +85,9 @@ def test_staged_reward():
     r = np.exp(-0.5)  # q8 / 3 = 0.5, clearance 0.7 - 0.2 = 0.5
     calm = 1 - np.tanh(0.5)
     np.testing.assert_allclose(terms, [[r, 0.5 * r, 2 * 0.5 * r, calm * 0.5 * r]])
+    one_jaw = state(log_centre=[4.0, 6.0, 0.7], touching=[True, False])
+    terms = crane_env.reward_terms(one_jaw, np.array([0.25]), COMMAND, omega2=2.0)
+    np.testing.assert_allclose(terms, [[r, 0.5 * r, 2 * 0.5 * r, 0.0]])
     high = crane_env.reward_terms(state(log_centre=[4.0, 6.0, 3.2]), np.array([0.25]), COMMAND)
     np.testing.assert_allclose(high[0, 2], 2 * np.exp(-0.25))  # clearance counts up to 1 m
 
