@@ -1,0 +1,567 @@
+"""Recurrent PPO: proximal policy optimisation with a memory, an LSTM, on the crane.
+
+The paper's third baseline (Vu et al., Sec. IV-B), after Schulman et al., 2017, and Hochreiter and
+Schmidhuber, 1997. What the last observation does not tell, the log's diameter or which way the
+grapple has been turning, the policy may remember:
+
+- h_t, c_t = LSTM(o_t, h_{t-1}, c_{t-1}), both 0 before the first observation of an episode;
+- a ~ N(mu(o_t, h_t), sigma^2) and V(o_t, h_t), otherwise as in PPO;
+- a minibatch holds whole sequences, the rollouts of some of the cranes; each starts from the state
+  that its crane had when the rollout began.
+
+With generalised advantage estimation:
+
+    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)      V(s_{t+1}) is 0 where an episode terminated and
+    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it
+    L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
+    rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
+
+    python recurrent_ppo_crane.py                      # the forestry crane, on two cores
+    python recurrent_ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8   # any Box/Box task
+    python recurrent_ppo_crane.py --resume runs/<run>/checkpoint.pt
+"""
+
+import os
+import sys
+import time
+from collections import deque
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import gymnasium
+import numpy as np
+import torch
+import torch.nn as nn
+import tyro
+from gymnasium.vector import AutoresetMode
+from torch.distributions import Normal
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import trange
+
+import crane_env
+
+ALGORITHM = "recurrent_ppo"
+MACHINE_ARGS = ("resume", "device", "torch_threads", "env_threads")  # not taken from a checkpoint
+
+State = tuple[torch.Tensor, torch.Tensor]  # h and c of the LSTM, (N, lstm_size) each
+
+
+@dataclass
+class Args:
+    # --- experiment
+    exp_name: str = "recurrent_ppo_crane"  # name of the run's folder
+    seed: int = 1  # seed of network, policy samples and episodes
+    total_timesteps: int = 1_228_800  # decisions to train for, over all cranes
+    device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
+    torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
+    resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
+    paper: bool = False  # take the paper's protocol (days of training) as defaults
+
+    # --- environment
+    env_id: str = "ForestryCrane-v0"  # or any Gymnasium task with flat Box spaces
+    num_envs: int = 64  # cranes simulated side by side
+    env_threads: int = 2  # physics threads
+    frame_skip: int = 20  # physics steps of 5 ms per decision
+    contact: Literal["primitive", "sdf"] = "primitive"  # contact model of jaws and log
+    reward: Literal["staged", "paper"] = "staged"  # staged, or as printed in the paper
+    omega2: float = 1.0  # sharpness of r_distance [1/m]
+    speed: Literal["real", "mjcf"] = "real"  # joint speed limits
+    offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
+    signed_yaw: bool = False  # observe the signed angle to the log instead of Delta_psi
+    pose_noise: Literal["none", "step", "episode"] = "none"  # error of the observed log pose
+    integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
+    """MuJoCo integrator"""
+    solver: Literal["Newton", "CG"] = "Newton"  # MuJoCo constraint solver
+    curriculum: bool = False  # raise the task's difficulty from 0 to 1 with the success rate
+
+    # --- algorithm
+    num_steps: int = 64  # decisions per crane and rollout
+    hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
+    lstm_size: int = 64  # width of the memory that both read
+    learning_rate: float = 7e-4  # Adam's step size
+    anneal_lr: bool = True  # lower the step size linearly to 0
+    gamma: float = 0.99  # discount per 0.1 s; other decision rates rescale it
+    gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
+    reward_scale: float = 0.02  # factor on the reward, per 0.1 s
+    num_minibatches: int = 4  # groups of cranes, each one gradient step on their whole rollouts
+    update_epochs: int = 8  # passes over each rollout
+    clip_coef: float = 0.2  # c, bound of the ratio's change
+    target_kl: float | None = 0.03  # an update ends with the epoch whose mean KL passes this
+    ent_coef: float = 0.0  # c_e, weight of the entropy
+    vf_coef: float = 0.5  # c_v, weight of the value loss
+    max_grad_norm: float = 0.5  # bound of the gradient's norm
+    log_std_init: float = -0.5  # log sigma at the start [action units]
+
+    # --- reports
+    eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
+    eval_trials: int = 20  # trials per log diameter in each (other tasks: episodes)
+    final_trials: int = 100  # trials per log diameter after training, 0 for none
+    eval_seed: int = 10_000  # seed of all evaluation trials
+
+
+# What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
+PAPER = Args(
+    paper=True,
+    total_timesteps=500_000_000,
+    num_envs=42,
+    frame_skip=1,
+    contact="sdf",
+    reward="paper",
+    offset="minus",
+    integrator="implicit",
+    solver="CG",
+    num_steps=1000,
+    hidden_sizes=(256, 256, 256, 256),
+    learning_rate=3e-4,
+    anneal_lr=False,
+    num_minibatches=21,
+    update_epochs=30,
+    target_kl=None,
+)
+PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
+lambda, clip range, minibatches, reward scale, weights of value loss and entropy, gradient bound,
+LSTM units, tanh units, no annealing, normalised observations and advantages, sigma at the start,
+omega 1-3 = 1, z_l,d = 1 m, speed limits "real", start of an episode, its length (9 s, not 15 s)."""
+
+
+def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
+    nn.init.orthogonal_(layer.weight, std)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class Agent(nn.Module):
+    """Actor, critic and the observation normaliser, all in one state_dict."""
+
+    def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
+        super().__init__()
+        act_dim = len(action_low)
+        features = obs_dim + args.lstm_size
+        self.lstm = nn.LSTM(obs_dim, args.lstm_size)
+        self.actor = self._network(features, args.hidden_sizes, act_dim, std=0.01)
+        self.log_std = nn.Parameter(torch.full((act_dim,), args.log_std_init))
+        self.critic = self._network(features, args.hidden_sizes, 1, std=1.0)
+        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
+        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
+        self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
+        self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
+        self.register_buffer("obs_count", torch.tensor(1e-4, dtype=torch.float64))
+
+    @staticmethod
+    def _network(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) -> nn.Module:
+        layers: list[nn.Module] = []
+        for width in hidden_sizes:
+            layers += [layer_init(nn.Linear(inputs, width)), nn.Tanh()]
+            inputs = width
+        return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
+
+    def update_normalizer(self, obs: torch.Tensor) -> None:
+        """Merge the mean and variance of obs (B, obs_dim) into the running ones (Chan et al.)."""
+        obs = obs.double()
+        count = self.obs_count + len(obs)
+        delta = obs.mean(0) - self.obs_mean
+        spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * len(obs)
+        self.obs_var.copy_((spread + delta**2 * self.obs_count * len(obs) / count) / count)
+        self.obs_mean.add_(delta * len(obs) / count)
+        self.obs_count.copy_(count)
+
+    def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+        scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
+        return scaled.clamp(-10, 10)
+
+    def initial_state(self, num_envs: int) -> State:
+        zeros = self.obs_mean.new_zeros((2, num_envs, self.lstm.hidden_size), dtype=torch.float32)
+        return zeros[0], zeros[1]
+
+    def remember(
+        self, obs: torch.Tensor, state: State, starts: torch.Tensor
+    ) -> tuple[torch.Tensor, State]:
+        """Features of obs (T, N, obs_dim) with the memory of what came before, and the last state.
+
+        state: h and c, (N, lstm_size), before obs[0]. starts (T, N) is 1 where obs begins an
+        episode, whose memory is empty.
+        """
+        scaled = self.normalize(obs)
+        h, c = (part[None] for part in state)
+        outputs = []
+        for x, start in zip(scaled, starts):
+            keep = (1 - start)[None, :, None]
+            output, (h, c) = self.lstm(x[None], (keep * h, keep * c))
+            outputs.append(output)
+        return torch.cat([scaled, torch.cat(outputs)], dim=-1), (h[0], c[0])
+
+    def get_value(self, features: torch.Tensor) -> torch.Tensor:
+        """V of features (..., obs_dim + lstm_size)."""
+        return self.critic(features).squeeze(-1)
+
+    def get_distribution(self, features: torch.Tensor) -> Normal:
+        """Gaussian over actions, batch shape (..., act_dim), before clipping to the limits."""
+        mean = self.actor(features)
+        return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
+
+    def predict(
+        self, obs: torch.Tensor, state: State, deterministic: bool = True
+    ) -> tuple[torch.Tensor, State]:
+        """Actions (N, act_dim) in the environment's units, and the state that follows."""
+        features, state = self.remember(obs[None], state, torch.zeros(1, len(obs)).to(obs))
+        distribution = self.get_distribution(features[0])
+        actions = distribution.mean if deterministic else distribution.sample()
+        return self.to_env(actions), state
+
+    def to_env(self, actions: torch.Tensor) -> torch.Tensor:
+        return torch.clamp(actions, self.action_low, self.action_high)
+
+
+def bootstrap_values(
+    values: torch.Tensor,
+    last_value: torch.Tensor,
+    terminations: torch.Tensor,
+    cut_at: list[tuple[int, int]],
+    cut_values: torch.Tensor | None,
+) -> torch.Tensor:
+    """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
+    next_values = torch.cat([values[1:], last_value[None]])
+    for (step, i), value in zip(cut_at, cut_values if cut_at else []):
+        next_values[step, i] = value
+    return next_values * (1 - terminations)
+
+
+def compute_gae(
+    rewards: torch.Tensor,
+    values: torch.Tensor,
+    next_values: torch.Tensor,
+    dones: torch.Tensor,
+    gamma: float,
+    gae_lambda: float,
+) -> torch.Tensor:
+    """Advantages (T, N) from rewards, values, `bootstrap_values` and episode ends, all (T, N)."""
+    advantages = torch.zeros_like(rewards)
+    last = torch.zeros_like(rewards[0])
+    for t in reversed(range(len(rewards))):
+        delta = rewards[t] + gamma * next_values[t] - values[t]
+        last = delta + gamma * gae_lambda * (1 - dones[t]) * last
+        advantages[t] = last
+    return advantages
+
+
+def crane_kwargs(args: Args) -> dict:
+    """The environment's arguments among args; none for other tasks."""
+    names = ["frame_skip", "contact", "reward", "omega2", "speed", "offset", "signed_yaw"]
+    names += ["pose_noise", "integrator", "solver", "env_threads"]
+    return {name: getattr(args, name) for name in names} if is_crane(args) else {}
+
+
+def is_crane(args: Args) -> bool:
+    return args.env_id.startswith("ForestryCrane")
+
+
+def make_envs(args: Args, num_envs: int, **kwargs) -> gymnasium.vector.VectorEnv:
+    if is_crane(args):
+        return gymnasium.make_vec(args.env_id, num_envs, **{**crane_kwargs(args), **kwargs})
+    autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    return gymnasium.make_vec(args.env_id, num_envs, "sync", vector_kwargs=autoreset)
+
+
+def evaluate(agent: Agent, args: Args, trials: int) -> dict[str, float]:
+    """Mean return, and for the crane success rates, of the mean action; trials per log diameter."""
+    if is_crane(args):
+        diameters, seeds = crane_env.monte_carlo_trials(args.eval_seed, trials)
+        envs = make_envs(args, len(seeds), diameter=diameters)
+        obs, _ = envs.reset(seed=seeds)
+    else:
+        envs = make_envs(args, trials)
+        obs, _ = envs.reset(seed=args.eval_seed)
+    returns, success = np.zeros(len(obs)), np.zeros(len(obs), bool)
+    ended = np.zeros(len(obs), bool)
+    state = agent.initial_state(len(obs))
+    while not ended.all():
+        with torch.no_grad():
+            obs = torch.as_tensor(obs, dtype=torch.float32, device=args.device)
+            actions, state = agent.predict(obs, state)
+        obs, reward, terminated, truncated, info = envs.step(actions.cpu().numpy())
+        returns += np.where(ended, 0, reward)
+        if is_crane(args):
+            success |= info["success"] & ~ended
+        ended |= terminated | truncated
+    envs.close()
+    result = {"eval/episodic_return": returns.mean()}
+    if is_crane(args):
+        result["eval/success_rate"] = success.mean()
+        for d in np.unique(diameters):
+            result[f"eval/success_rate_{d:.1f}m"] = success[diameters == d].mean()
+    return result
+
+
+def save_atomically(contents: dict, path: Path) -> None:
+    torch.save(contents, path.with_suffix(".tmp"))
+    os.replace(path.with_suffix(".tmp"), path)
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args, description=__doc__, default=PAPER if "--paper" in sys.argv else Args())
+    checkpoint = None
+    if args.resume is not None:
+        if not Path(args.resume).is_file():
+            raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
+        try:
+            checkpoint = torch.load(args.resume, map_location=args.device, weights_only=True)
+            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
+        except Exception:
+            ours = False
+        if not ours:
+            raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
+        machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+        args = Args(**{**checkpoint["args"], **machine})
+    elif args.paper:
+        print(PAPER_GUESSES)
+    if min(args.num_envs, args.num_steps, args.num_minibatches) < 1:
+        raise SystemExit("--num-envs, --num-steps and --num-minibatches must be at least 1")
+    if args.num_envs % args.num_minibatches:
+        raise SystemExit(
+            "--num-envs must be a multiple of --num-minibatches: cranes are shared out"
+        )
+    batch_size = args.num_envs * args.num_steps
+    num_iterations = max(1, args.total_timesteps // batch_size)
+    # gamma, lambda and the reward scale are stated per 0.1 s
+    tenths = args.frame_skip / 20 if is_crane(args) else 1.0
+    gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
+    reward_scale = args.reward_scale * tenths
+
+    torch.manual_seed(args.seed)
+    device = torch.device(args.device)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
+
+    try:
+        envs = make_envs(args, args.num_envs)
+    except (gymnasium.error.Error, ValueError) as error:
+        raise SystemExit(f"{args.env_id}: {error}") from None
+    obs_space, action_space = envs.single_observation_space, envs.single_action_space
+    spaces = (obs_space, action_space)
+    if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
+        raise SystemExit(f"--env-id: {args.env_id} has no flat Box observations and actions")
+    agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
+
+    first_iteration = 1
+    difficulty = 0.0 if args.curriculum else 1.0
+    if checkpoint is not None:
+        agent.load_state_dict(checkpoint["weights"])
+        optimizer.load_state_dict(checkpoint["optimizer"])
+        torch.set_rng_state(checkpoint["torch_rng"].cpu())
+        first_iteration = checkpoint["iteration"] + 1
+        difficulty = checkpoint["difficulty"]
+        run_dir = Path(args.resume).parent
+    else:
+        run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        run_dir = Path("runs") / run_name.replace("/", "-")
+    writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
+    rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
+    writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + rows)
+
+    def save(iteration: int) -> None:
+        policy = {
+            "algorithm": ALGORITHM,
+            "args": asdict(args),
+            "weights": agent.state_dict(),
+            "global_step": iteration * batch_size,
+        }
+        writer.flush()
+        save_atomically(policy, run_dir / "policy.pt")
+        state = {
+            "optimizer": optimizer.state_dict(),
+            "iteration": iteration,
+            "torch_rng": torch.get_rng_state(),
+            "difficulty": difficulty,
+        }
+        save_atomically(policy | state, run_dir / "checkpoint.pt")
+
+    obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
+    actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
+    rewards = torch.zeros((args.num_steps, args.num_envs), device=device)
+    dones = torch.zeros((args.num_steps, args.num_envs), device=device)
+    terminations = torch.zeros((args.num_steps, args.num_envs), device=device)
+    starts = torch.zeros((args.num_steps, args.num_envs), device=device)
+
+    # A resumed run starts new episodes, other ones than the interrupted run has seen.
+    if is_crane(args):
+        envs.unwrapped.difficulty = difficulty
+    reset_seed = np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0]
+    next_obs, _ = envs.reset(seed=int(reset_seed))
+    next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
+    next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
+    episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
+    recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
+    start_time = time.time()
+
+    completed = first_iteration - 1
+    progress = trange(first_iteration, num_iterations + 1, initial=completed, total=num_iterations)
+    try:
+        for iteration in progress:
+            # ---- rollout: the actor alone; values and log-probabilities follow in one batch
+            rollout_start = time.time()
+            torch.set_num_threads(1)
+            fraction = 1.0 - (iteration - 1.0) / num_iterations
+            if args.anneal_lr:
+                optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
+            ended: dict[str, list] = {"return": [], "length": [], "termination": []}
+            terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
+            cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
+            cut_states = []  # what was remembered of them
+            first_state = state
+            for step in range(args.num_steps):
+                obs[step], starts[step] = next_obs, next_start
+                with torch.no_grad():
+                    features, state = agent.remember(next_obs[None], state, next_start[None])
+                    actions[step] = agent.get_distribution(features[0]).sample()
+                    env_actions = agent.to_env(actions[step]).cpu().numpy()
+                next_obs, reward, terminated, truncated, info = envs.step(env_actions)
+                next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
+                done = terminated | truncated
+                rewards[step] = torch.as_tensor(reward * reward_scale, device=device)
+                dones[step] = next_start = torch.as_tensor(done, device=device).float()
+                terminations[step] = torch.as_tensor(terminated, device=device)
+
+                episodic_return += reward
+                episodic_length += 1
+                for i in np.flatnonzero(done):
+                    if truncated[i] and not terminated[i]:
+                        cut_at.append((step, i))
+                        cut_obs.append(info["final_obs"][i].astype(np.float32))
+                        cut_states.append(torch.stack([part[i] for part in state]))
+                    ended["return"].append(episodic_return[i])
+                    ended["length"].append(episodic_length[i])
+                    if is_crane(args):
+                        ended["termination"].append(info["termination"][i])
+                        recent_success.append(info["success"][i])
+                episodic_return[done], episodic_length[done] = 0, 0
+                if is_crane(args):
+                    for name in terms:
+                        terms[name] += info[name].mean() / args.num_steps
+            recent_returns.extend(ended["return"])
+            global_step = iteration * batch_size
+            update_start = time.time()
+
+            # ---- advantages
+            torch.set_num_threads(args.torch_threads)
+            with torch.no_grad():
+                features, _ = agent.remember(obs, first_state, starts)
+                values = agent.get_value(features)
+                logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
+                # looks ahead of the live state, which goes on from where it is
+                features, _ = agent.remember(next_obs[None], state, next_start[None])
+                last_value, cut_values = agent.get_value(features[0]), None
+                if cut_at:
+                    last_obs = torch.as_tensor(np.stack(cut_obs), device=device)[None]
+                    h, c = torch.stack(cut_states, dim=1)
+                    features, _ = agent.remember(
+                        last_obs, (h, c), torch.zeros_like(last_obs[..., 0])
+                    )
+                    cut_values = agent.get_value(features[0])
+                next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
+                advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
+                returns = advantages + values
+
+            # ---- update
+            stats: dict[str, list[float]] = {}
+            for _ in range(args.update_epochs):
+                cranes = torch.randperm(args.num_envs, device=device)
+                for mb in cranes.split(args.num_envs // args.num_minibatches):
+                    mb_state = tuple(part[mb] for part in first_state)
+                    features, _ = agent.remember(obs[:, mb], mb_state, starts[:, mb])
+                    distribution = agent.get_distribution(features)
+                    logratio = distribution.log_prob(actions[:, mb]).sum(-1) - logprobs[:, mb]
+                    ratio = logratio.exp()
+                    mb_advantages = advantages[:, mb]
+                    mb_advantages = (mb_advantages - mb_advantages.mean()) / (
+                        mb_advantages.std() + 1e-8
+                    )
+                    clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+                    policy_loss = -torch.min(mb_advantages * ratio, mb_advantages * clipped).mean()
+                    value_loss = ((agent.get_value(features) - returns[:, mb]) ** 2).mean()
+                    entropy = distribution.entropy().sum(-1).mean()
+                    loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
+
+                    optimizer.zero_grad()
+                    loss.backward()
+                    grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+                    optimizer.step()
+
+                    with torch.no_grad():
+                        new_stats = {
+                            "losses/policy_loss": policy_loss,
+                            "losses/value_loss": value_loss,
+                            "losses/entropy": entropy,
+                            "losses/old_approx_kl": -logratio.mean(),
+                            "losses/approx_kl": (ratio - 1 - logratio).mean(),
+                            "losses/clipfrac": ((ratio - 1).abs() > args.clip_coef).float().mean(),
+                            "losses/grad_norm": grad_norm,
+                        }
+                    for name, value in new_stats.items():
+                        stats.setdefault(name, []).append(value.item())
+                epoch_kl = np.mean(stats["losses/approx_kl"][-args.num_minibatches :])
+                if args.target_kl is not None and epoch_kl > args.target_kl:
+                    break
+            with torch.no_grad():
+                stats["policy/std"] = [agent.log_std.exp().mean().item()]
+                residual_var = (returns - values).var()
+                stats["losses/explained_variance"] = [(1 - residual_var / returns.var()).item()]
+                # only now, so that rollout and update have seen the same policy
+                agent.update_normalizer(obs.flatten(0, 1))
+            completed = iteration
+
+            # ---- reports
+            now = time.time()
+            sps = (iteration - first_iteration + 1) * batch_size / (now - start_time)
+            report = {name: np.mean(values) for name, values in stats.items()}
+            report["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
+            report["charts/updates"] = iteration
+            report["charts/SPS"] = sps
+            report["time/rollout"] = update_start - rollout_start
+            report["time/update"] = now - update_start
+            if ended["return"]:
+                report["charts/episodic_return"] = np.mean(ended["return"])
+                report["charts/episodic_length"] = np.mean(ended["length"])
+            if is_crane(args):
+                report["charts/simulation_SPS"] = sps * args.frame_skip
+                report["charts/difficulty"] = difficulty
+                report |= {f"reward/{name[2:]}": value for name, value in terms.items()}
+                if ended["return"]:
+                    report["charts/success_rate"] = np.mean(recent_success)
+                    for name in crane_env.TERMINATIONS[1:]:
+                        share = np.mean(np.array(ended["termination"]) == name)
+                        report[f"termination/{name}"] = share
+                    full = len(recent_success) == recent_success.maxlen
+                    if args.curriculum and full and np.mean(recent_success) > 0.5:
+                        difficulty = min(1.0, difficulty + 0.05)
+                        envs.unwrapped.difficulty = difficulty
+                        recent_success.clear()
+            last = iteration == num_iterations
+            if args.eval_every and (iteration % args.eval_every == 0 or last):
+                report |= evaluate(agent, args, args.eval_trials)
+                report["time/evaluation"] = time.time() - now
+            for name, value in report.items():
+                writer.add_scalar(name, value, global_step)
+            shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
+            if is_crane(args) and recent_success:
+                shown["success"] = np.mean(recent_success)
+            progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
+            if args.paper and iteration == first_iteration:
+                progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")
+            if iteration % 10 == 0 or last:
+                save(iteration)
+        progress.close()
+        if args.final_trials:
+            for name, value in evaluate(agent, args, args.final_trials).items():
+                name = name.replace("eval/", "final/")
+                writer.add_scalar(name, value, num_iterations * batch_size)
+                print(f"{name}: {value:.3f}")
+    except KeyboardInterrupt:
+        save(completed)
+        progress.close()
+        print(f"interrupted; go on with --resume {run_dir / 'checkpoint.pt'}")
+        raise SystemExit(130) from None
+    writer.close()
+    envs.close()
+    print(f"policy saved to {run_dir / 'policy.pt'}")

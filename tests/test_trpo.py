@@ -1,0 +1,132 @@
+"""TRPO's linear algebra against explicit matrices (what all scripts share: test_scripts.py)."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Normal
+
+import trpo_crane
+from trpo_crane import Agent, Args, conjugate_gradient, fisher_vector_product, flat, line_search
+
+
+def make_agent(seed=0):
+    torch.manual_seed(seed)
+    agent = Agent(3, np.full(2, -1.0), np.full(2, 1.0), Args(hidden_sizes=(4,))).double()
+    with torch.no_grad():  # at the small weights of the start F is nearly that of the last layer
+        agent.actor[-1].weight.mul_(100)
+    agent.obs_mean += 0.1
+    return agent
+
+
+def explicit_fisher(agent, obs):
+    """E[grad log pi grad log pi^T] of a Gaussian: J^T Sigma^-1 J; 2 I for log sigma."""
+    parameters = agent.policy_parameters()
+    size = sum(p.numel() for p in parameters)
+    fisher = torch.zeros(size, size, dtype=torch.float64)
+    for x in obs:
+        mean = agent.get_distribution(x[None]).mean[0]
+        rows = []
+        for k in range(2):
+            grads = torch.autograd.grad(
+                mean[k], parameters, retain_graph=True, allow_unused=True, materialize_grads=True
+            )
+            rows.append(flat(grads))
+        jacobian = torch.stack(rows)
+        fisher += jacobian.T @ torch.diag(torch.exp(-2 * agent.log_std.detach())) @ jacobian
+    fisher /= len(obs)
+    fisher[-2:, -2:] += 2 * torch.eye(2, dtype=torch.float64)
+    return fisher
+
+
+def test_fisher_vector_product():
+    agent = make_agent()
+    obs = torch.randn(7, 3, dtype=torch.float64)
+    fisher = explicit_fisher(agent, obs)
+    assert fisher[:-2, :-2].abs().max() > 0.1
+    for _ in range(5):
+        vector = torch.randn(len(fisher), dtype=torch.float64)
+        product = fisher_vector_product(agent, obs, vector, damping=0.3)
+        torch.testing.assert_close(product, fisher @ vector + 0.3 * vector, rtol=1e-6, atol=1e-6)
+
+
+def test_conjugate_gradient():
+    torch.manual_seed(1)
+    root = torch.randn(12, 12, dtype=torch.float64)
+    matrix, b = root @ root.T + torch.eye(12), torch.randn(12, dtype=torch.float64)
+    x, residual = conjugate_gradient(lambda v: matrix @ v, b, iterations=50)
+    np.testing.assert_allclose(x, np.linalg.solve(matrix.numpy(), b.numpy()), rtol=1e-6)
+    assert residual < 1e-9
+    x, residual = conjugate_gradient(lambda v: matrix @ v, b, iterations=2)
+    assert (
+        residual == pytest.approx(((matrix @ x - b).norm() / b.norm()).item()) and residual > 1e-3
+    )
+    x, residual = conjugate_gradient(lambda v: matrix @ v, 0 * b, iterations=5)
+    assert torch.equal(x, 0 * b) and residual == 0
+
+
+def make_batch(agent):
+    obs = torch.randn(64, 3, dtype=torch.float64)
+    with torch.no_grad():
+        old = agent.get_distribution(obs)
+        actions = old.sample()
+    advantages = actions[:, 0] - actions[:, 0].mean()
+    return obs, actions, advantages, old
+
+
+def ascent(agent, batch):
+    surrogate, _ = trpo_crane.surrogate_and_kl(agent, *batch)
+    return flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
+
+
+def test_surrogate_and_kl():
+    agent = make_agent()
+    batch = make_batch(agent)
+    surrogate, kl = trpo_crane.surrogate_and_kl(agent, *batch)
+    assert surrogate.item() == pytest.approx(0, abs=1e-12) and kl.item() == pytest.approx(0)
+    old = Normal(batch[3].loc - 0.1, batch[3].scale / 2)
+    _, kl = trpo_crane.surrogate_and_kl(agent, *batch[:3], old)
+    sigma = math.exp(-0.5)  # log(s2 / s1) + (s1^2 + d^2) / (2 s2^2) - 1/2, for both actions
+    expected = math.log(2) + ((sigma / 2) ** 2 + 0.01) / (2 * sigma**2) - 0.5
+    assert kl.item() == pytest.approx(2 * expected)
+
+
+def test_line_search_shortens_until_the_divergence_permits():
+    agent = make_agent()
+    batch, before = make_batch(agent), flat(p.detach() for p in agent.policy_parameters())
+    step = 10 * ascent(agent, batch)
+    args = Args(max_kl=0.01, line_search_steps=40, line_search_decay=0.5)
+    fraction, kl, improvement = line_search(agent, step, batch, args)
+    assert fraction == 0.5 ** round(math.log2(1 / fraction)) and fraction < 1
+    assert 0 < kl <= 0.01 and improvement > 0
+    after = flat(p.detach() for p in agent.policy_parameters())
+    torch.testing.assert_close(after - before, fraction * step)
+    surrogate, new_kl = trpo_crane.surrogate_and_kl(agent, *batch)
+    assert new_kl.item() == pytest.approx(kl) and surrogate.item() == pytest.approx(improvement)
+
+
+@pytest.mark.parametrize("failure", ["downhill", "too far", "not finite"])
+def test_line_search_restores_exactly_on_failure(failure):
+    agent = make_agent()
+    batch, before = make_batch(agent), [p.clone() for p in agent.policy_parameters()]
+    step = {"downhill": -1e-3, "too far": 1e6, "not finite": float("nan")}[failure]
+    result = line_search(agent, step * ascent(agent, batch), batch, Args(max_kl=0.01))
+    assert result == (0.0, 0.0, 0.0)
+    assert all(torch.equal(a, b) for a, b in zip(before, agent.policy_parameters()))
+
+
+def test_natural_step_spends_the_divergence_it_is_given():
+    """For a small delta the quadratic model holds: KL(s) is delta, the gain g^T s."""
+    agent = make_agent()
+    batch = make_batch(agent)
+    gradient = ascent(agent, batch)
+
+    def matvec(v):
+        return fisher_vector_product(agent, batch[0], v, damping=1e-6)
+
+    direction, _ = conjugate_gradient(matvec, gradient, 100)
+    step = torch.sqrt(2 * 1e-6 / (direction @ matvec(direction))) * direction
+    fraction, kl, improvement = line_search(agent, step, batch, Args(max_kl=1.01e-6))
+    assert fraction == 1 and kl == pytest.approx(1e-6, rel=0.01)
+    assert improvement == pytest.approx((gradient @ step).item(), rel=0.01)
