@@ -249,13 +249,13 @@ def reward_terms(
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
     in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
-    before it, its r_lift counts twice, and r_balance asks for both jaws on the log. Why: README,
-    errata.
+    before it, counts r_lift twice, and pays r_balance while both jaws hold the log, whatever is
+    commanded to them. Why: README, errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
-    calm = 1 - np.tanh(np.linalg.norm(command, axis=-1))
     if kind == "paper":
+        calm = 1 - np.tanh(np.linalg.norm(command, axis=-1))
         r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
         height_error = np.abs(state.log_centre[:, 2] - DESIRED_HEIGHT)
         r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
@@ -264,6 +264,7 @@ def reward_terms(
         r_grapple = r_distance * closed
         lift = r_distance * np.clip(log_clearance(state), 0, 1)
         held = state.touching.all(axis=-1)
+        calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))
         r_lift, r_balance = 2 * lift, calm * lift * held
     return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
 

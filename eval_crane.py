@@ -28,9 +28,13 @@ from tqdm import tqdm
 
 import crane_env
 import mppo_beta_crane
+import ppo_crane
+import recurrent_ppo_crane
+import trpo_crane
 from crane_env import CraneVectorEnv, monte_carlo_trials
 
-ALGORITHMS = {"mppo_beta": mppo_beta_crane}
+SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
+ALGORITHMS = {script.ALGORITHM: script for script in SCRIPTS}
 SHIPPED = Path(__file__).parent / "assets" / "policies" / "mppo_beta_crane.pt"
 PAPER = {  # % of 100 trials per diameter in m
     "none": {0.3: 94, 0.4: 96, 0.5: 98, 0.6: 98, 0.7: 96, 0.8: 96},  # Table I
@@ -98,9 +102,17 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         raise SystemExit(f"{path}: weights do not fit a {algorithm} policy: {reason}") from None
 
     def make_act() -> Act:
+        state = None
+
+        @torch.no_grad()
         def act(obs: np.ndarray) -> np.ndarray:
-            with torch.no_grad():
-                return agent.predict(torch.as_tensor(obs), not stochastic).numpy()
+            nonlocal state
+            obs = torch.as_tensor(obs)
+            if algorithm != "recurrent_ppo":
+                return agent.predict(obs, not stochastic).numpy()
+            state = agent.initial_state(len(obs)) if state is None else state
+            actions, state = agent.predict(obs, state, not stochastic)
+            return actions.numpy()
 
         return act
 

@@ -1,7 +1,8 @@
 """How cheap may MuJoCo's search for SDF contacts be? One policy, 120 trials, several settings.
 
 A setting agrees with MuJoCo's default (40 starts, 10 iterations) in a trial when both succeed
-or both fail. Writes benchmark/sdf_search.csv.
+or both fail; miss_change_m is by how much the grip's place along the log differs, on average over
+trials that both succeed. Writes benchmark/sdf_search.csv.
 
     python benchmark/sdf_search.py [policy.pt]
 """
@@ -34,12 +35,15 @@ if __name__ == "__main__":
         records = eval_crane.run_trials(make_act, {**kwargs, **options}, diameters, seeds)
         seconds = time.perf_counter() - start
         success = np.array([record["success"] for record in records])
-        reference = success if reference is None else reference
+        miss = np.array([record["centre_miss"] for record in records])
+        reference = (success, miss) if reference is None else reference
+        both = success & reference[0]
         row = {
             "sdf_initpoints": initpoints,
             "sdf_iterations": iterations,
             "success_rate": success.mean().round(4),
-            "agreement": (success == reference).mean().round(4),
+            "agreement": (success == reference[0]).mean().round(4),
+            "miss_change_m": np.abs(miss - reference[1])[both].mean().round(4),
             "seconds": round(seconds, 1),
         }
         rows.append(row)

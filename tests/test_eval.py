@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,30 @@ def test_stochastic_and_sdf(monkeypatch):
     assert len(sdf) == 2
 
 
+@pytest.mark.parametrize("script", eval_crane.SCRIPTS)
+def test_acts_as_the_agent_of_any_algorithm(tmp_path, script):
+    torch.manual_seed(0)
+    args = script.Args(hidden_sizes=(16,))
+    agent = script.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
+    with torch.no_grad():
+        agent.actor[-1].weight.mul_(100)
+    policy = {"algorithm": script.ALGORITHM, "args": asdict(args), "weights": agent.state_dict()}
+    torch.save(policy, tmp_path / "policy.pt")
+    make_act, _, name = eval_crane.load_policy(tmp_path / "policy.pt", stochastic=False)
+    assert name == script.ALGORITHM
+    obs = torch.randn(3, 5, 18)  # three decisions of five cranes
+    act, again = make_act(), make_act()
+    acted = torch.stack([torch.as_tensor(act(o.numpy())) for o in obs])
+    if name == "recurrent_ppo":
+        features, _ = agent.remember(obs, agent.initial_state(5), torch.zeros(3, 5))
+        expected = agent.to_env(agent.get_distribution(features).mean)
+        fresh = again(obs[2].numpy())
+        assert np.abs(fresh - acted[2].numpy()).max() > 1e-3  # it remembered the first two
+    else:
+        expected = torch.stack([agent.predict(o) for o in obs])
+    torch.testing.assert_close(acted, expected.detach(), rtol=0, atol=1e-6)
+
+
 def test_same_trial_in_any_batch(monkeypatch):
     """A trial does not depend on which trials are simulated beside it.
 
@@ -126,7 +151,7 @@ def test_clear_errors(tmp_path):
     assert "is no policy.pt of this repository" in error_of(tmp_path / "junk.pt")
     saved = torch.load(eval_crane.SHIPPED, weights_only=True)
     torch.save({**saved, "algorithm": "sac"}, tmp_path / "sac.pt")
-    assert "unknown algorithm 'sac'; known: mppo_beta" in error_of(tmp_path / "sac.pt")
+    assert "unknown algorithm 'sac'; known: mppo_beta, ppo" in error_of(tmp_path / "sac.pt")
     args = {**saved["args"], "hidden_sizes": (8, 8)}
     torch.save({**saved, "args": args}, tmp_path / "shape.pt")
     assert "weights do not fit" in error_of(tmp_path / "shape.pt")

@@ -75,7 +75,7 @@ def test_clearance_and_miss():
     np.testing.assert_allclose(crane_env.centre_miss(gripped), [0.5])
 
 
-COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 0.0]])  # norm 0.5
+COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaws, 1.3 with them
 
 
 def test_staged_reward():
@@ -99,7 +99,7 @@ def test_paper_reward():
     r = np.exp(-0.5)
     grapple = 0.5 * r + 0.5 * (1 - r)
     lift = (1 - np.tanh(3.0 * 0.3)) * (1 - grapple)
-    balance = (1 - np.tanh(0.5)) * (1 - lift)
+    balance = (1 - np.tanh(1.3)) * (1 - lift)
     np.testing.assert_allclose(terms, [[r, grapple, lift, balance]])
 
 
