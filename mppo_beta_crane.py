@@ -52,7 +52,7 @@ class Args:
     # --- experiment
     exp_name: str = "mppo_beta_crane"  # name of the run's folder
     seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 1_228_800  # decisions to train for, over all cranes
+    total_timesteps: int = 1_638_400  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
@@ -68,7 +68,7 @@ class Args:
     omega2: float = 1.0  # sharpness of r_distance [1/m]
     speed: Literal["real", "mjcf"] = "real"  # joint speed limits
     offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
-    signed_yaw: bool = False  # observe the signed angle to the log instead of Delta_psi
+    signed_yaw: bool = True  # observe the signed angle to the log, not the paper's Delta_psi
     pose_noise: Literal["none", "step", "episode"] = "none"  # error of the observed log pose
     integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
     """MuJoCo integrator"""
@@ -86,7 +86,7 @@ class Args:
     minibatch_size: int = 1024  # decisions per gradient step
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
-    target_kl: float | None = 0.03  # an update ends with the epoch whose mean KL passes this
+    target_kl: float | None = 0.06  # an update ends with the epoch whose mean KL passes this
     ent_coef: float = 0.0  # c_e, weight of the entropy
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
@@ -111,6 +111,7 @@ PAPER = Args(
     contact="sdf",
     reward="paper",
     offset="minus",
+    signed_yaw=False,
     integrator="implicit",
     solver="CG",
     num_steps=1000,

@@ -128,7 +128,7 @@ def test_curriculum_starts_easy(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "variant", [["--contact", "sdf", "--pose-noise", "step"], ["--signed-yaw", "--offset", "minus"]]
+    "variant", [["--contact", "sdf", "--pose-noise", "step"], ["--no-signed-yaw", "--offset", "minus"]]
 )
 def test_variants_of_the_task_train(tmp_path, variant):
     run(
