@@ -10,7 +10,8 @@ The paper's own algorithm (Vu et al., Sec. III-B). Three things set it apart fro
 The rest is PPO (Schulman et al., 2017), with generalised advantage estimation:
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)      V(s_{t+1}) is 0 where an episode terminated and
-    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it
+    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it;
+                                                   A_{t+1} is 0 where an episode ended
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
@@ -54,7 +55,7 @@ class Args:
     seed: int = 1  # seed of network, policy samples and episodes
     total_timesteps: int = 1_638_400  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
+    torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
@@ -214,8 +215,9 @@ def bootstrap_values(
 ) -> torch.Tensor:
     """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
     next_values = torch.cat([values[1:], last_value[None]])
-    for (step, i), value in zip(cut_at, cut_values if cut_at else []):
-        next_values[step, i] = value
+    if cut_at:
+        steps, cranes = zip(*cut_at)
+        next_values[steps, cranes] = cut_values
     return next_values * (1 - terminations)
 
 
@@ -238,10 +240,10 @@ def compute_gae(
 
 
 def crane_kwargs(args: Args) -> dict:
-    """The environment's arguments among args; none for other tasks."""
+    """The crane environment's arguments among args."""
     names = ["frame_skip", "contact", "reward", "omega2", "speed", "offset", "signed_yaw"]
     names += ["pose_noise", "integrator", "solver", "env_threads"]
-    return {name: getattr(args, name) for name in names} if is_crane(args) else {}
+    return {name: getattr(args, name) for name in names}
 
 
 def is_crane(args: Args) -> bool:
@@ -250,7 +252,7 @@ def is_crane(args: Args) -> bool:
 
 def make_envs(args: Args, num_envs: int, **kwargs) -> gymnasium.vector.VectorEnv:
     if is_crane(args):
-        return gymnasium.make_vec(args.env_id, num_envs, **{**crane_kwargs(args), **kwargs})
+        return gymnasium.make_vec(args.env_id, num_envs, **crane_kwargs(args), **kwargs)
     autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
     return gymnasium.make_vec(args.env_id, num_envs, "sync", vector_kwargs=autoreset)
 
@@ -295,14 +297,15 @@ if __name__ == "__main__":
         if not Path(args.resume).is_file():
             raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
-            checkpoint = torch.load(args.resume, map_location=args.device, weights_only=True)
+            checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
+            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+            args = Args(**{**checkpoint["args"], **machine})
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
         except Exception:
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        machine = {name: getattr(args, name) for name in MACHINE_ARGS}
-        args = Args(**{**checkpoint["args"], **machine})
+        print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
     if min(args.num_envs, args.num_steps, args.minibatch_size) < 1:
@@ -310,8 +313,8 @@ if __name__ == "__main__":
     batch_size = args.num_envs * args.num_steps
     num_minibatches = -(-batch_size // args.minibatch_size)
     num_iterations = max(1, args.total_timesteps // batch_size)
-    if batch_size % args.minibatch_size == 1:
-        raise SystemExit("--minibatch-size leaves one sample over, which has no standard deviation")
+    if args.minibatch_size == 1 or batch_size % args.minibatch_size == 1:
+        raise SystemExit("--minibatch-size leaves one sample alone, with no standard deviation")
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
     gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
@@ -340,7 +343,6 @@ if __name__ == "__main__":
     if checkpoint is not None:
         agent.load_state_dict(checkpoint["weights"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        torch.set_rng_state(checkpoint["torch_rng"].cpu())
         first_iteration = checkpoint["iteration"] + 1
         difficulty = checkpoint["difficulty"]
         run_dir = Path(args.resume).parent
@@ -363,7 +365,6 @@ if __name__ == "__main__":
         state = {
             "optimizer": optimizer.state_dict(),
             "iteration": iteration,
-            "torch_rng": torch.get_rng_state(),
             "difficulty": difficulty,
         }
         save_atomically(policy | state, run_dir / "checkpoint.pt")
@@ -374,11 +375,13 @@ if __name__ == "__main__":
     dones = torch.zeros((args.num_steps, args.num_envs), device=device)
     terminations = torch.zeros((args.num_steps, args.num_envs), device=device)
 
-    # A resumed run starts new episodes, other ones than the interrupted run has seen.
     if is_crane(args):
         envs.unwrapped.difficulty = difficulty
-    reset_seed = np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0]
-    next_obs, _ = envs.reset(seed=int(reset_seed))
+    # A resumed run meets other episodes and samples than the interrupted run has met.
+    reset_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
+    if checkpoint is not None:
+        torch.manual_seed(reset_seed)
+    next_obs, _ = envs.reset(seed=reset_seed)
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
     episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
     recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
@@ -390,7 +393,7 @@ if __name__ == "__main__":
         for iteration in progress:
             # ---- rollout: the actor alone; values and log-probabilities follow in one batch
             rollout_start = time.time()
-            torch.set_num_threads(1)
+            torch.set_num_threads(1)  # more only wait for each other in its small batches
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
@@ -484,10 +487,12 @@ if __name__ == "__main__":
                     for name, value in new_stats.items():
                         stats.setdefault(name, []).append(value.item())
                 epoch_kl = np.mean(stats["losses/approx_kl"][-num_minibatches:])
-                if args.target_kl is not None and epoch_kl > args.target_kl:
+                # rpo's shift alone would pass the bound
+                bounded = args.target_kl is not None and args.perturb != "rpo"
+                if bounded and epoch_kl > args.target_kl:
                     break
             with torch.no_grad():
-                policy = agent.get_distribution(b_obs[: args.minibatch_size])
+                policy = agent.get_distribution(b_obs)
                 boundary = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
                 stats["policy/alpha"] = [policy.concentration1.mean().item()]
                 stats["policy/beta"] = [policy.concentration0.mean().item()]
@@ -524,10 +529,6 @@ if __name__ == "__main__":
                         difficulty = min(1.0, difficulty + 0.05)
                         envs.unwrapped.difficulty = difficulty
                         recent_success.clear()
-            last = iteration == num_iterations
-            if args.eval_every and (iteration % args.eval_every == 0 or last):
-                report |= evaluate(agent, args, args.eval_trials)
-                report["time/evaluation"] = time.time() - now
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
             shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
@@ -536,8 +537,12 @@ if __name__ == "__main__":
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")
+            last = iteration == num_iterations
             if iteration % 10 == 0 or last:
                 save(iteration)
+            if args.eval_every and (iteration % args.eval_every == 0 or last):
+                for name, value in evaluate(agent, args, args.eval_trials).items():
+                    writer.add_scalar(name, value, global_step)
         progress.close()
         if args.final_trials:
             for name, value in evaluate(agent, args, args.final_trials).items():

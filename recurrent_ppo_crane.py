@@ -1,8 +1,8 @@
 """Recurrent PPO: proximal policy optimisation with a memory, an LSTM, on the crane.
 
 The paper's third baseline (Vu et al., Sec. IV-B), after Schulman et al., 2017, and Hochreiter and
-Schmidhuber, 1997. What the last observation does not tell, the log's diameter or which way the
-grapple has been turning, the policy may remember:
+Schmidhuber, 1997. What one observation does not tell, the log's diameter or how fast the grapple
+swings, the policy may infer from what it remembers:
 
 - h_t, c_t = LSTM(o_t, h_{t-1}, c_{t-1}), both 0 before the first observation of an episode;
 - a ~ N(mu(o_t, h_t), sigma^2) and V(o_t, h_t), otherwise as in PPO;
@@ -12,7 +12,8 @@ grapple has been turning, the policy may remember:
 With generalised advantage estimation:
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)      V(s_{t+1}) is 0 where an episode terminated and
-    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it
+    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it;
+                                                   A_{t+1} is 0 where an episode ended
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
@@ -54,7 +55,7 @@ class Args:
     seed: int = 1  # seed of network, policy samples and episodes
     total_timesteps: int = 1_638_400  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
+    torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
@@ -139,7 +140,7 @@ class Agent(nn.Module):
         super().__init__()
         act_dim = len(action_low)
         features = obs_dim + args.lstm_size
-        self.lstm = nn.LSTM(obs_dim, args.lstm_size)
+        self.lstm = nn.LSTMCell(obs_dim, args.lstm_size)
         self.actor = self._network(features, args.hidden_sizes, act_dim, std=0.01)
         self.log_std = nn.Parameter(torch.full((act_dim,), args.log_std_init))
         self.critic = self._network(features, args.hidden_sizes, 1, std=1.0)
@@ -184,13 +185,13 @@ class Agent(nn.Module):
         episode, whose memory is empty.
         """
         scaled = self.normalize(obs)
-        h, c = (part[None] for part in state)
-        outputs = []
+        h, c = state
+        memories = []
         for x, start in zip(scaled, starts):
-            keep = (1 - start)[None, :, None]
-            output, (h, c) = self.lstm(x[None], (keep * h, keep * c))
-            outputs.append(output)
-        return torch.cat([scaled, torch.cat(outputs)], dim=-1), (h[0], c[0])
+            keep = (1 - start)[:, None]
+            h, c = self.lstm(x, (keep * h, keep * c))
+            memories.append(h)
+        return torch.cat([scaled, torch.stack(memories)], dim=-1), (h, c)
 
     def get_value(self, features: torch.Tensor) -> torch.Tensor:
         """V of features (..., obs_dim + lstm_size)."""
@@ -223,8 +224,9 @@ def bootstrap_values(
 ) -> torch.Tensor:
     """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
     next_values = torch.cat([values[1:], last_value[None]])
-    for (step, i), value in zip(cut_at, cut_values if cut_at else []):
-        next_values[step, i] = value
+    if cut_at:
+        steps, cranes = zip(*cut_at)
+        next_values[steps, cranes] = cut_values
     return next_values * (1 - terminations)
 
 
@@ -247,10 +249,10 @@ def compute_gae(
 
 
 def crane_kwargs(args: Args) -> dict:
-    """The environment's arguments among args; none for other tasks."""
+    """The crane environment's arguments among args."""
     names = ["frame_skip", "contact", "reward", "omega2", "speed", "offset", "signed_yaw"]
     names += ["pose_noise", "integrator", "solver", "env_threads"]
-    return {name: getattr(args, name) for name in names} if is_crane(args) else {}
+    return {name: getattr(args, name) for name in names}
 
 
 def is_crane(args: Args) -> bool:
@@ -259,7 +261,7 @@ def is_crane(args: Args) -> bool:
 
 def make_envs(args: Args, num_envs: int, **kwargs) -> gymnasium.vector.VectorEnv:
     if is_crane(args):
-        return gymnasium.make_vec(args.env_id, num_envs, **{**crane_kwargs(args), **kwargs})
+        return gymnasium.make_vec(args.env_id, num_envs, **crane_kwargs(args), **kwargs)
     autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
     return gymnasium.make_vec(args.env_id, num_envs, "sync", vector_kwargs=autoreset)
 
@@ -306,14 +308,15 @@ if __name__ == "__main__":
         if not Path(args.resume).is_file():
             raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
-            checkpoint = torch.load(args.resume, map_location=args.device, weights_only=True)
+            checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
+            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+            args = Args(**{**checkpoint["args"], **machine})
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
         except Exception:
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        machine = {name: getattr(args, name) for name in MACHINE_ARGS}
-        args = Args(**{**checkpoint["args"], **machine})
+        print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
     if min(args.num_envs, args.num_steps, args.num_minibatches) < 1:
@@ -323,6 +326,8 @@ if __name__ == "__main__":
             "--num-envs must be a multiple of --num-minibatches: cranes are shared out"
         )
     batch_size = args.num_envs * args.num_steps
+    if batch_size // args.num_minibatches < 2:
+        raise SystemExit("--num-minibatches leaves one sample alone, with no standard deviation")
     num_iterations = max(1, args.total_timesteps // batch_size)
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
@@ -350,7 +355,6 @@ if __name__ == "__main__":
     if checkpoint is not None:
         agent.load_state_dict(checkpoint["weights"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        torch.set_rng_state(checkpoint["torch_rng"].cpu())
         first_iteration = checkpoint["iteration"] + 1
         difficulty = checkpoint["difficulty"]
         run_dir = Path(args.resume).parent
@@ -373,7 +377,6 @@ if __name__ == "__main__":
         state = {
             "optimizer": optimizer.state_dict(),
             "iteration": iteration,
-            "torch_rng": torch.get_rng_state(),
             "difficulty": difficulty,
         }
         save_atomically(policy | state, run_dir / "checkpoint.pt")
@@ -385,11 +388,13 @@ if __name__ == "__main__":
     terminations = torch.zeros((args.num_steps, args.num_envs), device=device)
     starts = torch.zeros((args.num_steps, args.num_envs), device=device)
 
-    # A resumed run starts new episodes, other ones than the interrupted run has seen.
     if is_crane(args):
         envs.unwrapped.difficulty = difficulty
-    reset_seed = np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0]
-    next_obs, _ = envs.reset(seed=int(reset_seed))
+    # A resumed run meets other episodes and samples than the interrupted run has met.
+    reset_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
+    if checkpoint is not None:
+        torch.manual_seed(reset_seed)
+    next_obs, _ = envs.reset(seed=reset_seed)
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
     episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
@@ -402,7 +407,7 @@ if __name__ == "__main__":
         for iteration in progress:
             # ---- rollout: the actor alone; values and log-probabilities follow in one batch
             rollout_start = time.time()
-            torch.set_num_threads(1)
+            torch.set_num_threads(1)  # more only wait for each other in its small batches
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
@@ -538,10 +543,6 @@ if __name__ == "__main__":
                         difficulty = min(1.0, difficulty + 0.05)
                         envs.unwrapped.difficulty = difficulty
                         recent_success.clear()
-            last = iteration == num_iterations
-            if args.eval_every and (iteration % args.eval_every == 0 or last):
-                report |= evaluate(agent, args, args.eval_trials)
-                report["time/evaluation"] = time.time() - now
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
             shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
@@ -550,8 +551,12 @@ if __name__ == "__main__":
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")
+            last = iteration == num_iterations
             if iteration % 10 == 0 or last:
                 save(iteration)
+            if args.eval_every and (iteration % args.eval_every == 0 or last):
+                for name, value in evaluate(agent, args, args.eval_trials).items():
+                    writer.add_scalar(name, value, global_step)
         progress.close()
         if args.final_trials:
             for name, value in evaluate(agent, args, args.final_trials).items():

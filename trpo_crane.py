@@ -6,8 +6,9 @@ The paper's second baseline (Vu et al., Sec. IV-B), after Schulman et al., 2015:
 - every rollout allows one step of the policy, the natural gradient's, as long as the mean KL
   divergence from the old policy permits:
 
-    max  g^T s   subject to   1/2 s^T F s <= delta,        g = grad E[rho A], F = Hessian of the KL
-    s    = sqrt(2 delta / x^T F x) x,   F x = g            by conjugate gradient, F v by two
+    max  g^T s   subject to   1/2 s^T F s <= delta,        g = grad E[rho A],
+    s    = sqrt(2 delta / x^T F x) x,   F x = g            F = Hessian of the KL + d I
+                                                           by conjugate gradient, F v by two
                                                            backward passes, never F itself
     accepted: the first of s, c s, c^2 s, ... with KL <= delta and E[rho A] improved, or none;
 
@@ -16,7 +17,8 @@ The paper's second baseline (Vu et al., Sec. IV-B), after Schulman et al., 2015:
 With generalised advantage estimation:
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)      V(s_{t+1}) is 0 where an episode terminated and
-    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it
+    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it;
+                                                   A_{t+1} is 0 where an episode ended
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
     python trpo_crane.py                      # the forestry crane, minutes on two cores
@@ -57,7 +59,7 @@ class Args:
     seed: int = 1  # seed of network, policy samples and episodes
     total_timesteps: int = 1_638_400  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 2  # CPU threads of the update (the rollout's small batches use one)
+    torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
@@ -90,7 +92,7 @@ class Args:
     update_epochs: int = 8  # passes of the critic over each rollout
     max_kl: float = 0.02  # delta, bound of the mean KL divergence of one step
     cg_iterations: int = 15  # of the conjugate gradient
-    cg_damping: float = 0.1  # added to the diagonal of F
+    cg_damping: float = 0.1  # d, added to the diagonal of F
     line_search_steps: int = 10  # at most
     line_search_decay: float = 0.8  # c, factor on the step from one to the next
     max_grad_norm: float = 0.5  # bound of the norm of the critic's gradient
@@ -197,32 +199,31 @@ def flat(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-def fisher_vector_product(
-    agent: Agent, obs: torch.Tensor, vector: torch.Tensor, damping: float
-) -> torch.Tensor:
-    """(F + damping I) vector, F the Hessian of the mean KL(pi_old || pi) over obs at pi = pi_old.
-
-    Two backward passes (Pearlmutter, 1994): F v is the gradient of (grad KL)^T v.
-    """
+def kl_gradient(agent: Agent, obs: torch.Tensor) -> torch.Tensor:
+    """Gradient of the mean KL(pi_old || pi) over obs at pi = pi_old: 0, but with its graph."""
     distribution = agent.get_distribution(obs)
     old = Normal(distribution.loc.detach(), distribution.scale.detach(), validate_args=False)
     kl = kl_divergence(old, distribution).sum(-1).mean()
-    gradient = flat(torch.autograd.grad(kl, agent.policy_parameters(), create_graph=True))
-    product = torch.autograd.grad(gradient @ vector, agent.policy_parameters())
+    return flat(torch.autograd.grad(kl, agent.policy_parameters(), create_graph=True))
+
+
+def fisher_vector_product(
+    agent: Agent, gradient: torch.Tensor, damping: float, vector: torch.Tensor
+) -> torch.Tensor:
+    """(F + damping I) vector: the gradient of `kl_gradient`^T vector (Pearlmutter, 1994)."""
+    parameters = agent.policy_parameters()
+    product = torch.autograd.grad(gradient @ vector, parameters, retain_graph=True)
     return flat(product) + damping * vector
 
 
 def conjugate_gradient(
-    matvec: Callable[[torch.Tensor], torch.Tensor],
-    b: torch.Tensor,
-    iterations: int,
-    tolerance: float = 1e-10,
+    matvec: Callable[[torch.Tensor], torch.Tensor], b: torch.Tensor, iterations: int
 ) -> tuple[torch.Tensor, float]:
-    """x with matvec(x) = b for a symmetric positive matrix, and ||matvec(x) - b|| / ||b||."""
+    """x with matvec(x) = b for a symmetric positive matrix, and its residual's norm over b's."""
     x, residual = torch.zeros_like(b), b.clone()
     direction, residual_sq = b.clone(), b @ b
     for _ in range(iterations):
-        if residual_sq <= tolerance**2 * (b @ b):
+        if residual_sq <= 1e-20 * (b @ b):
             break
         product = matvec(direction)
         step = residual_sq / (direction @ product)
@@ -259,15 +260,20 @@ def line_search(
     old_parameters = [p.clone() for p in parameters]
     pieces = full_step.split([p.numel() for p in parameters])
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
-    for k in range(args.line_search_steps):
-        fraction = args.line_search_decay**k
-        for p, old, piece in zip(parameters, old_parameters, pieces):
-            p.copy_(old + fraction * piece.view_as(p))
-        surrogate, kl = surrogate_and_kl(agent, *batch)
-        if kl <= args.max_kl and surrogate > old_surrogate:
-            return fraction, kl.item(), (surrogate - old_surrogate).item()
-    for p, old in zip(parameters, old_parameters):
-        p.copy_(old)
+    accepted = False
+    try:
+        for k in range(args.line_search_steps):
+            fraction = args.line_search_decay**k
+            for p, old, piece in zip(parameters, old_parameters, pieces):
+                p.copy_(old + fraction * piece.view_as(p))
+            surrogate, kl = surrogate_and_kl(agent, *batch)
+            accepted = bool(kl <= args.max_kl and surrogate > old_surrogate)
+            if accepted:
+                return fraction, kl.item(), (surrogate - old_surrogate).item()
+    finally:  # also on Ctrl-C
+        if not accepted:
+            for p, old in zip(parameters, old_parameters):
+                p.copy_(old)
     return 0.0, 0.0, 0.0
 
 
@@ -280,8 +286,9 @@ def bootstrap_values(
 ) -> torch.Tensor:
     """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
     next_values = torch.cat([values[1:], last_value[None]])
-    for (step, i), value in zip(cut_at, cut_values if cut_at else []):
-        next_values[step, i] = value
+    if cut_at:
+        steps, cranes = zip(*cut_at)
+        next_values[steps, cranes] = cut_values
     return next_values * (1 - terminations)
 
 
@@ -304,10 +311,10 @@ def compute_gae(
 
 
 def crane_kwargs(args: Args) -> dict:
-    """The environment's arguments among args; none for other tasks."""
+    """The crane environment's arguments among args."""
     names = ["frame_skip", "contact", "reward", "omega2", "speed", "offset", "signed_yaw"]
     names += ["pose_noise", "integrator", "solver", "env_threads"]
-    return {name: getattr(args, name) for name in names} if is_crane(args) else {}
+    return {name: getattr(args, name) for name in names}
 
 
 def is_crane(args: Args) -> bool:
@@ -316,7 +323,7 @@ def is_crane(args: Args) -> bool:
 
 def make_envs(args: Args, num_envs: int, **kwargs) -> gymnasium.vector.VectorEnv:
     if is_crane(args):
-        return gymnasium.make_vec(args.env_id, num_envs, **{**crane_kwargs(args), **kwargs})
+        return gymnasium.make_vec(args.env_id, num_envs, **crane_kwargs(args), **kwargs)
     autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
     return gymnasium.make_vec(args.env_id, num_envs, "sync", vector_kwargs=autoreset)
 
@@ -361,22 +368,23 @@ if __name__ == "__main__":
         if not Path(args.resume).is_file():
             raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
-            checkpoint = torch.load(args.resume, map_location=args.device, weights_only=True)
+            checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
+            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+            args = Args(**{**checkpoint["args"], **machine})
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
         except Exception:
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        machine = {name: getattr(args, name) for name in MACHINE_ARGS}
-        args = Args(**{**checkpoint["args"], **machine})
+        print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
     if min(args.num_envs, args.num_steps, args.minibatch_size) < 1:
         raise SystemExit("--num-envs, --num-steps and --minibatch-size must be at least 1")
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
-    if batch_size % args.minibatch_size == 1:
-        raise SystemExit("--minibatch-size leaves one sample over, which has no standard deviation")
+    if batch_size < 2:
+        raise SystemExit("one sample has no standard deviation: raise --num-envs or --num-steps")
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
     gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
@@ -403,7 +411,6 @@ if __name__ == "__main__":
     if checkpoint is not None:
         agent.load_state_dict(checkpoint["weights"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        torch.set_rng_state(checkpoint["torch_rng"].cpu())
         first_iteration = checkpoint["iteration"] + 1
         difficulty = checkpoint["difficulty"]
         run_dir = Path(args.resume).parent
@@ -426,7 +433,6 @@ if __name__ == "__main__":
         state = {
             "optimizer": optimizer.state_dict(),
             "iteration": iteration,
-            "torch_rng": torch.get_rng_state(),
             "difficulty": difficulty,
         }
         save_atomically(policy | state, run_dir / "checkpoint.pt")
@@ -437,11 +443,13 @@ if __name__ == "__main__":
     dones = torch.zeros((args.num_steps, args.num_envs), device=device)
     terminations = torch.zeros((args.num_steps, args.num_envs), device=device)
 
-    # A resumed run starts new episodes, other ones than the interrupted run has seen.
     if is_crane(args):
         envs.unwrapped.difficulty = difficulty
-    reset_seed = np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0]
-    next_obs, _ = envs.reset(seed=int(reset_seed))
+    # A resumed run meets other episodes and samples than the interrupted run has met.
+    reset_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
+    if checkpoint is not None:
+        torch.manual_seed(reset_seed)
+    next_obs, _ = envs.reset(seed=reset_seed)
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
     episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
     recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
@@ -453,7 +461,7 @@ if __name__ == "__main__":
         for iteration in progress:
             # ---- rollout: the actor alone; values and log-probabilities follow in one batch
             rollout_start = time.time()
-            torch.set_num_threads(1)
+            torch.set_num_threads(1)  # more only wait for each other in its small batches
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
@@ -511,7 +519,8 @@ if __name__ == "__main__":
             batch = (b_obs, b_actions, b_advantages, old)
             surrogate, _ = surrogate_and_kl(agent, *batch)
             gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-            matvec = partial(fisher_vector_product, agent, b_obs, damping=args.cg_damping)
+            kl_grad = kl_gradient(agent, b_obs)
+            matvec = partial(fisher_vector_product, agent, kl_grad, args.cg_damping)
             direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
             curvature = direction @ matvec(direction)
             full_step = torch.sqrt(2 * args.max_kl / (curvature + 1e-12)) * direction
@@ -573,10 +582,6 @@ if __name__ == "__main__":
                         difficulty = min(1.0, difficulty + 0.05)
                         envs.unwrapped.difficulty = difficulty
                         recent_success.clear()
-            last = iteration == num_iterations
-            if args.eval_every and (iteration % args.eval_every == 0 or last):
-                report |= evaluate(agent, args, args.eval_trials)
-                report["time/evaluation"] = time.time() - now
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
             shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
@@ -585,8 +590,12 @@ if __name__ == "__main__":
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")
+            last = iteration == num_iterations
             if iteration % 10 == 0 or last:
                 save(iteration)
+            if args.eval_every and (iteration % args.eval_every == 0 or last):
+                for name, value in evaluate(agent, args, args.eval_trials).items():
+                    writer.add_scalar(name, value, global_step)
         progress.close()
         if args.final_trials:
             for name, value in evaluate(agent, args, args.final_trials).items():

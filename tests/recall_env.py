@@ -1,6 +1,7 @@
 """A task of memory, `Recall-v0`: name the cue of the first step four steps later.
 
-`Echo-v0` is its first step alone, which needs no memory.
+`Echo-v0` is its first step alone, which needs no memory. `Endless-v0` pays 1 for ever, under a time
+limit of 5 steps; `Unbounded-v0` is the same without bounds on the action.
 """
 
 import gymnasium
@@ -33,3 +34,21 @@ class Recall(gymnasium.Env):
 
 gymnasium.register("Recall-v0", entry_point=Recall)
 gymnasium.register("Echo-v0", entry_point=Recall, kwargs={"length": 1})
+
+
+class Endless(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, bound: float = 1.0):
+        self.action_space = gymnasium.spaces.Box(-bound, bound, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 1.0, False, False, {}
+
+
+gymnasium.register("Endless-v0", entry_point=Endless, max_episode_steps=5)
+gymnasium.register("Unbounded-v0", entry_point=Endless, kwargs={"bound": np.inf})

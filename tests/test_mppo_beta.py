@@ -128,7 +128,8 @@ def test_curriculum_starts_easy(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "variant", [["--contact", "sdf", "--pose-noise", "step"], ["--no-signed-yaw", "--offset", "minus"]]
+    "variant",
+    [["--contact", "sdf", "--pose-noise", "step"], ["--no-signed-yaw", "--offset", "minus"]],
 )
 def test_variants_of_the_task_train(tmp_path, variant):
     run(
@@ -142,17 +143,3 @@ def test_variants_of_the_task_train(tmp_path, variant):
         "2",
     )
     assert len(scalars(only_run(tmp_path))["losses/policy_loss"]) == 2
-
-
-def test_paper_protocol(tmp_path):
-    """Its defaults, under explicit arguments that make two updates short."""
-    short = "--num-envs 2 --num-steps 20 --minibatch-size 20 --update-epochs 1 --eval-every 0"
-    short = [*short.split(), "--final-trials", "0", "--total-timesteps", "80"]
-    result = run(ALGORITHM, tmp_path, "--paper", *short)
-    assert "guessed" in result.stdout and "estimated hours" in result.stdout + result.stderr
-    args = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)["args"]
-    assert args["hidden_sizes"] == (256, 256, 256, 256) and args["learning_rate"] == 3e-4
-    assert args["frame_skip"] == 1 and args["contact"] == "sdf" and args["reward"] == "paper"
-    assert args["integrator"] == "implicit" and args["solver"] == "CG" and args["num_envs"] == 2
-    assert mppo_beta_crane.PAPER.num_envs == 42 and mppo_beta_crane.PAPER.num_steps == 1000
-    assert mppo_beta_crane.PAPER.update_epochs == 30

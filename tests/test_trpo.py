@@ -8,7 +8,15 @@ import torch
 from torch.distributions import Normal
 
 import trpo_crane
-from trpo_crane import Agent, Args, conjugate_gradient, fisher_vector_product, flat, line_search
+from trpo_crane import (
+    Agent,
+    Args,
+    conjugate_gradient,
+    fisher_vector_product,
+    flat,
+    kl_gradient,
+    line_search,
+)
 
 
 def make_agent(seed=0):
@@ -47,7 +55,7 @@ def test_fisher_vector_product():
     assert fisher[:-2, :-2].abs().max() > 0.1
     for _ in range(5):
         vector = torch.randn(len(fisher), dtype=torch.float64)
-        product = fisher_vector_product(agent, obs, vector, damping=0.3)
+        product = fisher_vector_product(agent, kl_gradient(agent, obs), 0.3, vector)
         torch.testing.assert_close(product, fisher @ vector + 0.3 * vector, rtol=1e-6, atol=1e-6)
 
 
@@ -116,14 +124,36 @@ def test_line_search_restores_exactly_on_failure(failure):
     assert all(torch.equal(a, b) for a, b in zip(before, agent.policy_parameters()))
 
 
+def test_interrupted_line_search_restores_exactly(monkeypatch):
+    agent = make_agent()
+    batch, before = make_batch(agent), [p.clone() for p in agent.policy_parameters()]
+    step, calls = 50 * ascent(agent, batch), []
+    surrogate_and_kl = trpo_crane.surrogate_and_kl
+
+    def interrupted(*arguments):
+        calls.append(flat(p.detach() for p in agent.policy_parameters()))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return surrogate_and_kl(*arguments)
+
+    monkeypatch.setattr(trpo_crane, "surrogate_and_kl", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        line_search(agent, step, batch, Args(max_kl=1e-6))
+    assert not torch.equal(calls[0], calls[2])  # it came in the middle of a trial
+    assert all(torch.equal(a, b) for a, b in zip(before, agent.policy_parameters()))
+
+
 def test_natural_step_spends_the_divergence_it_is_given():
     """For a small delta the quadratic model holds: KL(s) is delta, the gain g^T s."""
     agent = make_agent()
     batch = make_batch(agent)
     gradient = ascent(agent, batch)
 
+    kl_grad = kl_gradient(agent, batch[0])
+    assert kl_grad.abs().max() < 1e-12  # pi is pi_old
+
     def matvec(v):
-        return fisher_vector_product(agent, batch[0], v, damping=1e-6)
+        return fisher_vector_product(agent, kl_grad, 1e-6, v)
 
     direction, _ = conjugate_gradient(matvec, gradient, 100)
     step = torch.sqrt(2 * 1e-6 / (direction @ matvec(direction))) * direction
