@@ -87,7 +87,7 @@ class Args:
     minibatch_size: int = 1024  # decisions per gradient step
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
-    target_kl: float | None = 0.06  # an update ends with the epoch whose mean KL passes this
+    target_kl: float | None = 0.04  # an update ends with the epoch whose mean KL passes this
     ent_coef: float = 0.0  # c_e, weight of the entropy
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
