@@ -108,7 +108,7 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         def act(obs: np.ndarray) -> np.ndarray:
             nonlocal state
             obs = torch.as_tensor(obs)
-            if algorithm != "recurrent_ppo":
+            if not hasattr(agent, "initial_state"):
                 return agent.predict(obs, not stochastic).numpy()
             state = agent.initial_state(len(obs)) if state is None else state
             actions, state = agent.predict(obs, state, not stochastic)
@@ -122,8 +122,9 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
 def fixed_policy(kind: str, seed: int) -> tuple[Callable[[], Act], dict, str]:
     """`load_policy` for policies without weights."""
 
+    rng = np.random.default_rng(seed)
+
     def make_act() -> Act:
-        rng = np.random.default_rng(seed)
         if kind == "zero":
             return lambda obs: np.zeros((len(obs), 6))
         return lambda obs: rng.uniform(-1, 1, (len(obs), 6))
@@ -134,13 +135,13 @@ def fixed_policy(kind: str, seed: int) -> tuple[Callable[[], Act], dict, str]:
 def run_trials(make_act: Callable[[], Act], kwargs: dict, diameters, seeds) -> list[dict]:
     """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m)."""
     records = []
-    envs = CraneVectorEnv(1, **kwargs)
     chunks = [slice(i, i + CRANES) for i in range(0, len(seeds), CRANES)]
-    bar = tqdm(total=len(chunks) * envs.max_decisions, desc=f"{len(seeds)} trials", leave=False)
+    bar = tqdm(total=0, desc=f"{len(seeds)} trials", leave=False)
     for chunk in chunks:
         envs = CraneVectorEnv(len(seeds[chunk]), diameter=diameters[chunk], **kwargs)
         obs, _ = envs.reset(seed=seeds[chunk])
         act, results = make_act(), [None] * envs.num_envs
+        bar.total = len(chunks) * envs.max_decisions
         for _ in range(envs.max_decisions):
             obs, _, terminated, truncated, info = envs.advance(act(obs))
             for i in np.flatnonzero(terminated | truncated):
@@ -284,10 +285,10 @@ def main() -> None:
     else:
         make_act, kwargs, name = fixed_policy(args.policy, args.seed)
         source = args.policy
-    torch.manual_seed(args.seed)
     torch.set_num_threads(1)  # small batches: more threads only wait for each other
     kwargs |= {"contact": args.contact, "env_threads": args.env_threads}
     if args.video or args.viewer:
+        torch.manual_seed(args.seed)
         kwargs["pose_noise"] = args.pose_noise or "none"
         return (film if args.video else show)(make_act, kwargs, args)
 
@@ -295,6 +296,7 @@ def main() -> None:
     noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
     all_records = []
     for noise in noises:
+        torch.manual_seed(args.seed)
         records = run_trials(make_act, {**kwargs, "pose_noise": noise}, diameters, seeds)
         cells = summarize(records)
         all_records += [{"pose_noise": noise, **record} for record in records]
