@@ -1,0 +1,196 @@
+"""Our scripts beside Stable-Baselines3 and sb3-contrib on tasks whose results are published.
+
+The same steps, networks, batch, epochs, step size, gamma, lambda and bounds on both
+sides, normalised observations, rewards by the same constant; final policies judged by the mean
+action in 20 episodes of the same seeds. Appends to benchmark/compare_sb3.csv and skips the rows it
+finds there.
+
+    pip install stable-baselines3 sb3-contrib
+    python benchmark/compare_sb3.py --help
+"""
+
+import csv
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+
+ROOT = Path(__file__).parent.parent
+RESULTS = Path(__file__).parent / "compare_sb3.csv"
+COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_return", "seconds"]
+EPISODES, EVAL_SEED = 20, 10_000
+
+
+@dataclass(frozen=True)
+class Task:
+    """Hyperparameters of rl-baselines3-zoo (Pendulum) and CleanRL's ppo_continuous_action."""
+
+    steps: int
+    num_envs: int
+    num_steps: int
+    minibatch_size: int
+    gamma: float
+    learning_rate: float
+    reward_scale: float
+
+
+TASKS = {
+    "Pendulum-v1": Task(100_000, 4, 1024, 64, 0.9, 1e-3, 0.1),
+    "HalfCheetah-v5": Task(300_000, 1, 2048, 64, 0.99, 3e-4, 0.1),
+}
+ALGORITHMS = ("ppo", "mppo_beta", "trpo")
+HIDDEN = (64, 64)
+EPOCHS, GAE_LAMBDA, CLIP = 10, 0.95, 0.2
+MAX_KL, CG_DAMPING, CG_ITERATIONS, CRITIC_LEARNING_RATE = 0.01, 0.1, 15, 1e-3  # TRPO
+    (64, 64),
+    10,
+    0.95,
+    0.2,
+    0.01,
+    0.1,
+    15,
+    1e-3,
+)
+
+
+@dataclass
+class Args:
+    tasks: tuple[str, ...] = tuple(TASKS)  # of Pendulum-v1, HalfCheetah-v5
+    algorithms: tuple[str, ...] = ALGORITHMS  # ours; SB3 has no Beta policy: its PPO stands there
+    seeds: tuple[int, ...] = (1, 2, 3)  # one run each
+
+
+def judge(task: str, act) -> tuple[float, float]:
+    """Mean and standard deviation of the return over EPISODES; act maps obs (n,) to an action."""
+    env, returns = gymnasium.make(task), []
+    for k in range(EPISODES):
+        obs, _ = env.reset(seed=EVAL_SEED + k)
+        total, done = 0.0, False
+        while not done:
+            obs, reward, terminated, truncated, _ = env.step(act(obs))
+            total, done = total + reward, terminated or truncated
+        returns.append(total)
+    return float(np.mean(returns)), float(np.std(returns))
+
+
+def train_ours(task: str, algorithm: str, seed: int):
+    t = TASKS[task]
+    flags = {
+        "env-id": task,
+        "seed": seed,
+        "total-timesteps": t.steps,
+        "num-envs": t.num_envs,
+        "num-steps": t.num_steps,
+        "minibatch-size": t.minibatch_size,
+        "update-epochs": EPOCHS,
+        "gamma": t.gamma,
+        "gae-lambda": GAE_LAMBDA,
+        "reward-scale": t.reward_scale,
+        "learning-rate": CRITIC_LEARNING_RATE if algorithm == "trpo" else t.learning_rate,
+        "eval-every": 0,
+        "final-trials": 0,
+    }
+    if algorithm == "trpo":
+        flags |= {"max-kl": MAX_KL, "cg-damping": CG_DAMPING, "cg-iterations": CG_ITERATIONS}
+    else:
+        flags |= {"clip-coef": CLIP, "target-kl": None}
+    if algorithm == "ppo":
+        flags["log-std-init"] = 0.0
+    words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
+    words += ["--no-anneal-lr", "--hidden-sizes", *map(str, HIDDEN)]
+    with tempfile.TemporaryDirectory() as folder:
+        script = str(ROOT / f"{algorithm}_crane.py")
+        subprocess.run(
+            [sys.executable, script, *words], cwd=folder, check=True, capture_output=True
+        )
+        (path,) = Path(folder).glob("runs/*/policy.pt")
+        sys.path.insert(0, str(ROOT))
+        import eval_crane
+
+        saved = torch.load(path, weights_only=True)
+        module = eval_crane.ALGORITHMS[algorithm]
+        env = gymnasium.make(task)
+        low, high = env.action_space.low, env.action_space.high
+        agent = module.Agent(
+            env.observation_space.shape[0], low, high, module.Args(**saved["args"])
+        )
+        agent.load_state_dict(saved["weights"])
+
+    @torch.no_grad()
+    def act(obs: np.ndarray) -> np.ndarray:
+        return agent.predict(torch.as_tensor(obs, dtype=torch.float32)[None])[0].numpy()
+
+    return act
+
+
+def train_sb3(task: str, algorithm: str, seed: int):
+    from sb3_contrib import TRPO
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    t = TASKS[task]
+    torch.set_num_threads(1)
+    envs = make_vec_env(
+        task,
+        t.num_envs,
+        seed=seed,
+        wrapper_class=gymnasium.wrappers.TransformReward,
+        wrapper_kwargs={"func": lambda reward: reward * t.reward_scale},
+    )
+    envs = VecNormalize(envs, norm_reward=False, gamma=t.gamma)
+    common = dict(
+        n_steps=t.num_steps,
+        batch_size=t.minibatch_size,
+        gamma=t.gamma,
+        gae_lambda=GAE_LAMBDA,
+        seed=seed,
+        device="cpu",
+        policy_kwargs={"net_arch": list(HIDDEN)},
+    )
+    if algorithm == "trpo":
+        own = dict(cg_max_steps=CG_ITERATIONS, cg_damping=CG_DAMPING, target_kl=MAX_KL)
+        model = TRPO(
+            "MlpPolicy", envs, learning_rate=CRITIC_LEARNING_RATE, n_critic_updates=EPOCHS, **own, **common
+        )
+    else:
+        own = dict(n_epochs=EPOCHS, clip_range=CLIP)
+        model = PPO("MlpPolicy", envs, learning_rate=t.learning_rate, **own, **common)
+    model.learn(t.steps)
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        return model.predict(envs.normalize_obs(obs), deterministic=True)[0]
+
+    return act
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args, description=__doc__)
+    rows = list(csv.DictReader(open(RESULTS))) if RESULTS.exists() else []
+    done = {(r["task"], r["algorithm"], r["library"], int(r["seed"])) for r in rows}
+    for task in args.tasks:
+        for seed in args.seeds:
+            for algorithm in args.algorithms:
+                for library, train in (("ours", train_ours), ("sb3", train_sb3)):
+                    if library == "sb3" and algorithm == "mppo_beta":
+                        continue
+                    if (task, algorithm, library, seed) in done:
+                        continue
+                    start = time.time()
+                    act = train(task, algorithm, seed)
+                    seconds = time.time() - start
+                    mean, std = judge(task, act)
+                    row = [task, algorithm, library, seed, TASKS[task].steps]
+                    row += [round(mean, 1), round(std, 1), round(seconds, 1)]
+                    new = not RESULTS.exists()
+                    with open(RESULTS, "a", newline="") as file:
+                        writer = csv.writer(file)
+                        writer.writerows([COLUMNS, row] if new else [row])
+                    print(*row, flush=True)
