@@ -49,15 +49,6 @@ ALGORITHMS = ("ppo", "mppo_beta", "trpo")
 HIDDEN = (64, 64)
 EPOCHS, GAE_LAMBDA, CLIP = 10, 0.95, 0.2
 MAX_KL, CG_DAMPING, CG_ITERATIONS, CRITIC_LEARNING_RATE = 0.01, 0.1, 15, 1e-3  # TRPO
-    (64, 64),
-    10,
-    0.95,
-    0.2,
-    0.01,
-    0.1,
-    15,
-    1e-3,
-)
 
 
 @dataclass
@@ -157,9 +148,8 @@ def train_sb3(task: str, algorithm: str, seed: int):
     )
     if algorithm == "trpo":
         own = dict(cg_max_steps=CG_ITERATIONS, cg_damping=CG_DAMPING, target_kl=MAX_KL)
-        model = TRPO(
-            "MlpPolicy", envs, learning_rate=CRITIC_LEARNING_RATE, n_critic_updates=EPOCHS, **own, **common
-        )
+        own |= dict(learning_rate=CRITIC_LEARNING_RATE, n_critic_updates=EPOCHS)
+        model = TRPO("MlpPolicy", envs, **own, **common)
     else:
         own = dict(n_epochs=EPOCHS, clip_range=CLIP)
         model = PPO("MlpPolicy", envs, learning_rate=t.learning_rate, **own, **common)
