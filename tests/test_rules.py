@@ -83,7 +83,7 @@ def test_staged_reward():
     terms = crane_env.reward_terms(state(**lifted), np.array([0.25]), COMMAND, omega2=2.0)
     r = np.exp(-0.5)  # q8 / 3 = 0.5, clearance 0.7 - 0.2 = 0.5
     balance = (1 - np.tanh(0.5)) * 0.6  # 0.12 m off the centre: 1 - 0.12 / 0.3
-    np.testing.assert_allclose(terms, [[r, 0.5 * r, 2 * 0.5 * r, balance * 0.5 * r]])
+    np.testing.assert_allclose(terms, [[r, 0.5 * r, 2 * 0.5 * r, 3 * balance * 0.5 * r]])
     lifted["grapple_centre"] = [4.0, 6.31, 0.7]
     terms = crane_env.reward_terms(state(**lifted), np.array([0.25]), COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [[r, 0.5 * r, 2 * 0.5 * r, 0.0]])
