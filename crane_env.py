@@ -249,8 +249,8 @@ def reward_terms(
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
     in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
-    before it, counts r_lift twice and r_balance thrice, and pays the latter while both jaws hold the
-    log, the more the nearer to its centre, whatever is commanded to them. Why: README, errata.
+    before it, counts r_lift twice and r_balance thrice, and pays the latter while both jaws hold
+    the log, the more the nearer to its centre, whatever is commanded to them. Why: README, errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
