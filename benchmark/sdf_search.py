@@ -31,6 +31,7 @@ if __name__ == "__main__":
     rows, reference = [], None
     for initpoints, iterations in SETTINGS:
         options = {"contact": "sdf", "sdf_initpoints": initpoints, "sdf_iterations": iterations}
+        options["env_threads"] = 0
         start = time.perf_counter()
         records = eval_crane.run_trials(make_act, {**kwargs, **options}, diameters, seeds)
         seconds = time.perf_counter() - start
@@ -41,9 +42,9 @@ if __name__ == "__main__":
         row = {
             "sdf_initpoints": initpoints,
             "sdf_iterations": iterations,
-            "success_rate": success.mean().round(4),
-            "agreement": (success == reference[0]).mean().round(4),
-            "miss_change_m": np.abs(miss - reference[1])[both].mean().round(4),
+            "success_rate": round(float(success.mean()), 4),
+            "agreement": round(float((success == reference[0]).mean()), 4),
+            "miss_change_m": round(float(np.abs(miss - reference[1])[both].mean()), 4),
             "seconds": round(seconds, 1),
         }
         rows.append(row)
