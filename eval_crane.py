@@ -85,8 +85,8 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         algorithm, args, weights = saved["algorithm"], saved["args"], saved["weights"]
-    except Exception as error:
-        raise SystemExit(f"{path} is no policy.pt of this repository ({error})") from None
+    except Exception:
+        raise SystemExit(f"{path} is no policy.pt of this repository") from None
     if algorithm not in ALGORITHMS:
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
     module = ALGORITHMS[algorithm]
@@ -277,6 +277,13 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     if args.trials < 1:
         raise SystemExit(f"--trials must be at least 1, got {args.trials}")
+    if not args.diameters:
+        raise SystemExit("--diameters needs at least one number")
+    if args.video and args.video.suffix not in (".mp4", ".gif"):
+        raise SystemExit(f"--video: {args.video} must end in .mp4 or .gif")
+    for path in filter(None, (args.video, args.csv)):
+        if not path.parent.is_dir():
+            raise SystemExit(f"no folder {path.parent}; make it first")
     if not all(crane_env.D_MIN <= d <= crane_env.D_MAX for d in args.diameters):
         raise SystemExit(f"--diameters must lie in [0.3, 0.8] m, got {args.diameters}")
     if args.policy == "file":

@@ -147,6 +147,9 @@ def test_clear_errors(tmp_path):
         return result.stderr
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
+    assert "at least one number" in error_of("--diameters")
+    assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
+    assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
     (tmp_path / "junk.pt").write_bytes(b"junk")
     assert "is no policy.pt of this repository" in error_of(tmp_path / "junk.pt")
     saved = torch.load(eval_crane.SHIPPED, weights_only=True)
