@@ -1,13 +1,16 @@
 """The Beta policy, its perturbation and its flags (what all scripts share: test_scripts.py)."""
 
 import math
+import runpy
+import sys
 
 import numpy as np
 import pytest
 import torch
-from script_runs import one_minibatch, only_run, run, scalars, small
+from script_runs import ROOT, one_minibatch, only_run, run, scalars, small
 from torch.distributions import Beta
 
+import crane_env
 import mppo_beta_crane
 from mppo_beta_crane import A_MIN, Agent, Args, shift_mean
 
@@ -113,18 +116,31 @@ def test_rpo_ratio_is_not_one(tmp_path):
     assert scalars(only_run(tmp_path))["losses/approx_kl"][0] > 1e-4
 
 
-def test_curriculum_starts_easy(tmp_path):
-    run(
-        ALGORITHM,
-        tmp_path,
-        *small(ALGORITHM),
-        "--curriculum",
-        "--total-timesteps",
-        "128",
-        "--eval-every",
-        "0",
-    )
-    assert scalars(only_run(tmp_path))["charts/difficulty"] == [0.0, 0.0]
+def test_curriculum_rises_with_success(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    advance = crane_env.CraneVectorEnv.advance
+
+    def lucky_advance(self, actions):
+        *step, info = advance(self, actions)
+        return *step, info | {"success": np.ones(self.num_envs, bool)}
+
+    monkeypatch.setattr(crane_env.CraneVectorEnv, "advance", lucky_advance)
+    arguments = "--curriculum --num-envs 64 --num-steps 64 --total-timesteps 24576 --eval-every 0"
+    arguments += " --update-epochs 1 --hidden-sizes 16 --final-trials 0"
+    monkeypatch.setattr(sys, "argv", ["mppo_beta_crane.py", *arguments.split()])
+    runpy.run_path(str(ROOT / "mppo_beta_crane.py"), run_name="__main__")
+    difficulty = scalars(only_run(tmp_path))["charts/difficulty"]
+    # 0.05 for every 200 episodes that succeeded; six rollouts of 64 cranes end more than 200
+    assert difficulty[0] == 0 and difficulty[-1] >= 0.05 - 1e-6
+    steps = np.diff(difficulty)
+    assert np.all(np.isclose(steps, 0) | np.isclose(steps, 0.05, atol=1e-6))
+    checkpoint = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)
+    assert checkpoint["difficulty"] >= difficulty[-1] - 1e-6
+
+
+def test_needs_bounded_actions(tmp_path):
+    result = run(ALGORITHM, tmp_path, "--env-id", "recall_env:Unbounded-v0", check=False)
+    assert result.returncode == 1 and "a Beta needs bounds" in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -132,14 +148,6 @@ def test_curriculum_starts_easy(tmp_path):
     [["--contact", "sdf", "--pose-noise", "step"], ["--no-signed-yaw", "--offset", "minus"]],
 )
 def test_variants_of_the_task_train(tmp_path, variant):
-    run(
-        ALGORITHM,
-        tmp_path,
-        *small(ALGORITHM),
-        *variant,
-        "--total-timesteps",
-        "128",
-        "--eval-every",
-        "2",
-    )
+    arguments = [*variant, "--total-timesteps", "128", "--eval-every", "2"]
+    run(ALGORITHM, tmp_path, *small(ALGORITHM), *arguments)
     assert len(scalars(only_run(tmp_path))["losses/policy_loss"]) == 2
