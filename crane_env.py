@@ -78,6 +78,7 @@ REACH_DISTANCE = 0.35  # m, bound of d_combine
 LOG_RANGE = 8.0  # m, between grapple centre and log centre
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
+CENTRED = 0.25  # m along the log, width of the staged reward's peak at the log's centre
 HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
 MAX_MISS = 0.3  # m along the log
@@ -249,8 +250,9 @@ def reward_terms(
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
     in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
-    before it, counts r_lift twice and r_balance thrice, and pays the latter while both jaws hold
-    the log, the more the nearer to its centre, whatever is commanded to them. Why: README, errata.
+    before it: r_grapple (twice) pays for closing near the log, sharper than r_distance; r_lift
+    (twice) for a log lifted near its centre; r_balance (thrice) only while both jaws hold it,
+    whatever is commanded to them. Why: README, errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -261,12 +263,12 @@ def reward_terms(
         r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
         r_balance = calm * (1 - r_lift)
     else:
-        r_grapple = r_distance * closed
-        lift = r_distance * np.clip(log_clearance(state), 0, 1)
+        r_grapple = 2 * r_distance**3 * closed
+        centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
+        lift = r_distance * centred * np.clip(log_clearance(state), 0, 1)
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))
-        centred = np.clip(1 - centre_miss(state) / MAX_MISS, 0, 1)
         held = state.touching.all(axis=-1)
-        r_lift, r_balance = 2 * lift, 3 * calm * centred * held * lift
+        r_lift, r_balance = 2 * lift, 3 * calm * held * lift
     return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
 
 

@@ -42,9 +42,6 @@ import crane_env
 
 ALGORITHM = "mppo_beta"
 MACHINE_ARGS = ("resume", "device", "torch_threads", "env_threads")  # not taken from a checkpoint
-# alpha, beta < 1 + e^3.5: at this bound a Beta about 1/2 is as wide as the default perturbation
-# (standard deviation 0.06); a narrower one takes its perturbed samples for outliers.
-MAX_LOG_EXCESS = 3.5
 A_MIN = 1e-4  # executed a_n stay in [A_MIN, 1 - A_MIN]: log-probabilities are infinite at 0 and 1
 
 
@@ -53,7 +50,7 @@ class Args:
     # --- experiment
     exp_name: str = "mppo_beta_crane"  # name of the run's folder
     seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 1_638_400  # decisions to train for, over all cranes
+    total_timesteps: int = 1_310_720  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
@@ -79,11 +76,11 @@ class Args:
     # --- algorithm
     num_steps: int = 64  # decisions per crane and rollout
     hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
-    learning_rate: float = 7e-4  # Adam's step size
+    learning_rate: float = 1e-3  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
-    gamma: float = 0.99  # discount per 0.1 s; other decision rates rescale it
+    gamma: float = 0.97  # discount per 0.1 s; other decision rates rescale it
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: float = 0.02  # factor on the reward, per 0.1 s
+    reward_scale: float = 0.06  # factor on the reward, per 0.1 s
     minibatch_size: int = 1024  # decisions per gradient step
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
@@ -95,6 +92,8 @@ class Args:
     """what eps moves: action, a_n as in Eq. (robust ppo); rpo, the mean, in the update only"""
     perturbation: float = 0.1  # eps, half width of the perturbation of a_n
     anneal_perturbation: bool = True  # lower eps linearly to 0
+    log_excess_init: float = 1.5  # log(alpha - 1) = log(beta - 1) at the start
+    log_excess_max: float = 5.0  # bound of their magnitude
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
@@ -119,10 +118,14 @@ PAPER = Args(
     hidden_sizes=(256, 256, 256, 256),
     learning_rate=3e-4,
     anneal_lr=False,
+    gamma=0.99,
+    reward_scale=0.02,
     minibatch_size=2000,
     update_epochs=30,
     target_kl=None,
     anneal_perturbation=False,
+    log_excess_init=0.0,
+    log_excess_max=3.5,  # a Beta narrower than the perturbation takes its samples for outliers
 )
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, clip range, minibatch size, reward scale, weights of value loss and entropy, gradient bound,
@@ -142,7 +145,9 @@ class Agent(nn.Module):
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
         act_dim = len(action_low)
+        self.log_excess_max = args.log_excess_max
         self.actor = self._network(obs_dim, args.hidden_sizes, 2 * act_dim, std=0.01)
+        nn.init.constant_(self.actor[-1].bias, args.log_excess_init)
         self.critic = self._network(obs_dim, args.hidden_sizes, 1, std=1.0)
         self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
         self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
@@ -178,7 +183,8 @@ class Agent(nn.Module):
 
     def get_distribution(self, obs: torch.Tensor) -> Beta:
         """Beta over a_n in [0, 1], batch shape (B, act_dim), alpha and beta above 1."""
-        log_excess = MAX_LOG_EXCESS * torch.tanh(self.actor(self.normalize(obs)) / MAX_LOG_EXCESS)
+        bound = self.log_excess_max
+        log_excess = bound * torch.tanh(self.actor(self.normalize(obs)) / bound)
         alpha, beta = (1 + log_excess.exp()).chunk(2, dim=-1)
         return Beta(alpha, beta, validate_args=False)
 

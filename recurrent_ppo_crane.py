@@ -53,7 +53,7 @@ class Args:
     # --- experiment
     exp_name: str = "recurrent_ppo_crane"  # name of the run's folder
     seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 1_638_400  # decisions to train for, over all cranes
+    total_timesteps: int = 1_310_720  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
@@ -82,9 +82,9 @@ class Args:
     lstm_size: int = 64  # width of the memory that both read
     learning_rate: float = 7e-4  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
-    gamma: float = 0.99  # discount per 0.1 s; other decision rates rescale it
+    gamma: float = 0.97  # discount per 0.1 s; other decision rates rescale it
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: float = 0.02  # factor on the reward, per 0.1 s
+    reward_scale: float = 0.06  # factor on the reward, per 0.1 s
     num_minibatches: int = 4  # groups of cranes, each one gradient step on their whole rollouts
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
@@ -92,7 +92,7 @@ class Args:
     ent_coef: float = 0.0  # c_e, weight of the entropy
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
-    log_std_init: float = -0.5  # log sigma at the start [action units]
+    log_std_init: float = -1.2  # log sigma at the start [action units]
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
@@ -117,6 +117,8 @@ PAPER = Args(
     hidden_sizes=(256, 256, 256, 256),
     learning_rate=3e-4,
     anneal_lr=False,
+    gamma=0.99,
+    reward_scale=0.02,
     num_minibatches=21,
     update_epochs=30,
     target_kl=None,

@@ -39,8 +39,8 @@ def test_alpha_and_beta_exceed_one_even_for_absurd_observations():
         agent.actor[-1].weight.mul_(1e6)
     distribution = agent.get_distribution(1e6 * torch.randn(64, 18))
     for concentration in (distribution.concentration1, distribution.concentration0):
-        assert concentration.min() > 1 and concentration.max() <= 1 + math.exp(3.5) + 1e-3
-        assert concentration.max() > 30
+        assert concentration.min() > 1 and concentration.max() <= 1 + math.exp(5) + 1e-2
+        assert concentration.max() > 140
 
 
 def set_head(agent, alpha_outputs, beta_outputs):
@@ -56,20 +56,28 @@ def test_log_probability_is_finite_at_the_clamps():
         set_head(agent, alpha, beta)
         for bound in (A_MIN, 1 - A_MIN):
             logprob = agent.get_distribution(torch.zeros(1, 18)).log_prob(torch.full((1, 6), bound))
-            assert torch.isfinite(logprob).all() and logprob.abs().max() < 350
+            assert torch.isfinite(logprob).all() and logprob.abs().max() < 1400
 
 
 def test_log_probability_is_the_beta_density():
     agent = make_agent()
-    set_head(agent, 1.0, -0.5)  # alpha = 1 + exp(3.5 tanh(1 / 3.5)), beta likewise
-    alpha = 1 + math.exp(3.5 * math.tanh(1 / 3.5))
-    beta = 1 + math.exp(3.5 * math.tanh(-0.5 / 3.5))
+    set_head(agent, 1.0, -0.5)  # alpha = 1 + exp(5 tanh(1 / 5)), beta likewise
+    alpha = 1 + math.exp(5 * math.tanh(1 / 5))
+    beta = 1 + math.exp(5 * math.tanh(-0.5 / 5))
     a = 0.3
     normalizer = math.gamma(alpha + beta) / (math.gamma(alpha) * math.gamma(beta))
     expected = 6 * math.log(normalizer * a ** (alpha - 1) * (1 - a) ** (beta - 1))
     distribution = agent.get_distribution(torch.zeros(1, 18))
     logprob = distribution.log_prob(torch.full((1, 6), a)).sum(-1)
     assert logprob.item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_untrained_policy_is_as_wide_as_asked():
+    torch.manual_seed(0)
+    agent = Agent(18, np.zeros(6), np.ones(6), Args(log_excess_init=math.log(3), log_excess_max=50))
+    distribution = agent.get_distribution(torch.randn(100, 18))
+    # alpha = beta = 4: variance 1 / (4 (alpha + beta + 1)) = 1 / 36
+    torch.testing.assert_close(distribution.stddev, torch.full((100, 6), 1 / 6), atol=5e-3, rtol=0)
 
 
 def test_mean_action_on_the_admissible_range():
