@@ -2,6 +2,7 @@
 
     python eval_crane.py                              # the shipped mPPO policy, Tables I and II
     python eval_crane.py runs/<run>/policy.pt         # any policy of this repository's scripts
+    python eval_crane.py --policy scripted            # without learning, see scripted_crane.py
     python eval_crane.py --policy random --trials 20
     python eval_crane.py --video lift.mp4             # or --viewer, in a window
 
@@ -32,6 +33,7 @@ import ppo_crane
 import recurrent_ppo_crane
 import trpo_crane
 from crane_env import CraneVectorEnv, monte_carlo_trials
+from scripted_crane import ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
 ALGORITHMS = {script.ALGORITHM: script for script in SCRIPTS}
@@ -48,8 +50,10 @@ Act = Callable[[np.ndarray], np.ndarray]  # observations (N, 18) to actions (N, 
 class Args:
     path: Annotated[Path, tyro.conf.Positional] = SHIPPED
     """policy.pt of a run"""
-    policy: Literal["file", "zero", "random"] = "file"
-    """file: the one at PATH; zero: never move; random: uniform actions"""
+    policy: Literal["file", "scripted", "zero", "random"] = "file"
+    """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions"""
+    signed_yaw: bool = True
+    """scripted observes the signed angle to the log, not the paper's Delta_psi"""
     trials: int = 100
     """trials per log diameter"""
     diameters: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
@@ -119,9 +123,13 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
     return make_act, module.crane_kwargs(args), algorithm
 
 
-def fixed_policy(kind: str, seed: int) -> tuple[Callable[[], Act], dict, str]:
+def fixed_policy(
+    kind: str, seed: int, signed_yaw: bool = True
+) -> tuple[Callable[[], Act], dict, str]:
     """`load_policy` for policies without weights."""
 
+    if kind == "scripted":
+        return lambda: ScriptedCrane(signed_yaw), {"signed_yaw": signed_yaw}, kind
     rng = np.random.default_rng(seed)
 
     def make_act() -> Act:
@@ -290,7 +298,7 @@ def main() -> None:
         make_act, kwargs, name = load_policy(args.path, args.stochastic)
         source = str(args.path)
     else:
-        make_act, kwargs, name = fixed_policy(args.policy, args.seed)
+        make_act, kwargs, name = fixed_policy(args.policy, args.seed, args.signed_yaw)
         source = args.policy
     torch.set_num_threads(1)  # small batches: more threads only wait for each other
     kwargs |= {"contact": args.contact, "env_threads": args.env_threads}

@@ -1,0 +1,226 @@
+"""A scripted crane: resolved-rate control and four phases, the classical rival of the policies.
+
+It sees what a policy sees, the 18 numbers of the observation, and learns nothing. It knows the
+crane's lengths and speed limits (assets/README.md) and that Delta_p is 0 where the jaws' tips just
+clear the ground, whatever the log's diameter (offset "plus").
+
+Frames: K_i = K_{i-1} RotZ(q_i) Trans(a, 0, d) RotX(alpha). A column of the Jacobian is z x (p - o)
+for a joint that turns about the axis z through o, and z for a telescope stage. The passive joints
+q5, q6 are not commanded, but where the grapple hangs plumb, q5 = pi/2 - q2 - q3 and q6 = pi/2:
+the Jacobian J of p_C and yaw by q1 ... q4, q7 is taken with dq5 = -dq2 - dq3 and dq6 = 0.
+Joint rates for a task velocity v = (dx, dy, dz, dyaw) by damped least squares, in fractions of the
+joints' limits, so that fast joints do more of the work (Nakamura and Hanafusa, 1986):
+
+    dq = J^T (J J^T + lambda^2 I)^-1 v
+
+The grapple's place when plumb is led over the log, at the height h above it that the phase asks
+for, and its swing s = p_C - p_plumb is damped by letting the tip follow it:
+
+    v = k_p (Delta_p + s + h) + k_s s     bounded in speed and acceleration
+    s'' = -omega^2 s - x''                of the tip at x; with x' = k_s s its damping is k_s s'
+
+Phases, one a crane: APPROACH (over the log, turning along it), DESCEND, CLOSE, LIFT.
+
+    python scripted_crane.py                       # 20 trials per log diameter, 10 s
+    python scripted_crane.py --no-signed-yaw       # the angle's sign must be found by turning
+    python eval_crane.py --policy scripted         # the tables; --video and --viewer work too
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from crane_env import SPEEDS, CraneVectorEnv, monte_carlo_trials
+
+DH = (  # a [m], d [m], alpha [rad] of q1, q2, q3, q4 stage 1, q4 stage 2, q5, q6, q7
+    (-0.18, 2.425, np.pi / 2),
+    (3.49288, 0.0, 0.0),
+    (-0.3925, 0.0, np.pi / 2),
+    (0.0, 3.157, 0.0),
+    (0.0, 0.0, -np.pi / 2),
+    (-0.213, 0.0, -np.pi / 2),
+    (0.0, 0.0, -np.pi / 2),
+    (0.0, 0.578, 0.0),
+)
+SLEW_HEIGHT = 1.1407  # m, of frame K0 above the ground
+CENTRE_DEPTH = 0.5  # m, p_C below K8
+DT = 0.1  # s, one decision
+LOW, HIGH = SPEEDS["real"][:, :5]  # speed limits of q1 ... q4, q7, rad/s and m/s
+SPEED = np.minimum(-LOW, HIGH)
+
+DAMPING = 0.1  # lambda, m/s at full joint speed; J's singular values there: 0.85 and more
+K_P = 1.5  # 1/s; half the pendulum's omega of 3 rad/s, so as not to drive it
+K_S = 2.5  # 1/s; adds k_s / (2 omega) = 0.4 to the damping ratio
+MAX_SPEED = 2.0  # m/s; the longest ways, 6 m, then take 4 s
+MAX_ACCELERATION = 2.0  # m/s^2; leans the grapple by 0.2 rad, a quarter of what q6 allows
+K_YAW = 3.0  # 1/s; from pi/2 to 0.1 rad in one second
+Q7_MAX = 5 / 6 * np.pi  # rad; goals start within pi/2 and drift with the slew, by pi/3 at most
+Q8_OPEN = 0.4  # rad; tips 2.2 m apart, and while hovering above a 0.8 m log
+HOVER = 0.4  # m above the closing height; the tips then pass over the log
+NEAR, NEARLY_ALIGNED = 0.5, 0.2  # m, rad; to descend: the tips stay clear of the log
+OVER, LEVEL, ALIGNED = 0.12, 0.03, 0.1  # m, m, rad; to close: higher, tips only pinch thin logs
+Q8_CLOSED, STALLED = 1.2, 0.1  # rad, rad/s; gripped: a 0.8 m log stops the jaws at 1.75 rad
+CARRY_HEIGHT = 1.2  # m, of p_C; the log then hangs 0.8 m above the ground
+APPROACH, DESCEND, CLOSE, LIFT = range(4)
+
+
+def forward_kinematics(q: np.ndarray) -> np.ndarray:
+    """Frames K0 ... K8 in the world, (9, N, 4, 4), of N cranes with joints q (N, 8), rad and m."""
+    frame = np.tile(np.eye(4), (len(q), 1, 1))
+    frame[:, 2, 3] = SLEW_HEIGHT
+    frames = [frame]
+    straight = np.zeros(len(q))
+    turns = [q[:, 0], q[:, 1], q[:, 2], straight, straight, q[:, 4], q[:, 5], q[:, 6]]
+    for i, ((a, d, alpha), theta) in enumerate(zip(DH, turns)):
+        extension = q[:, 3] if i in (3, 4) else 0.0
+        c, s = np.cos(theta), np.sin(theta)
+        link = np.zeros((len(q), 4, 4))
+        link[:, 0] = np.stack([c, -s * np.cos(alpha), s * np.sin(alpha), a * c], axis=-1)
+        link[:, 1] = np.stack([s, c * np.cos(alpha), -c * np.sin(alpha), a * s], axis=-1)
+        link[:, 2, 1], link[:, 2, 2] = np.sin(alpha), np.cos(alpha)
+        link[:, 2, 3], link[:, 3, 3] = d + extension, 1.0
+        frames.append(frames[-1] @ link)
+    return np.stack(frames)
+
+
+def grapple_centre(frames: np.ndarray) -> np.ndarray:
+    """p_C (N, 3) in m, on the z axis of K8."""
+    return frames[-1, :, :3, 3] + CENTRE_DEPTH * frames[-1, :, :3, 2]
+
+
+def plumb(q: np.ndarray) -> np.ndarray:
+    """q (N, 8) with the passive joints where gravity holds them at rest."""
+    q = q.copy()
+    q[:, 4], q[:, 5] = np.pi / 2 - q[:, 1] - q[:, 2], np.pi / 2
+    return q
+
+
+def plumb_jacobian(frames: np.ndarray) -> np.ndarray:
+    """d(x, y, z, yaw of the grapple) / d(q1 ... q4, q7), (N, 4, 5), from a plumb crane's frames."""
+    axis, origin = frames[:-1, :, :3, 2], frames[:-1, :, :3, 3]
+    turning = np.concatenate(  # rows x, y, z, yaw of each joint, (8, N, 4)
+        [np.cross(axis, grapple_centre(frames) - origin), axis[:, :, 2:]], axis=-1
+    )
+    telescope = np.concatenate([axis[3] + axis[4], np.zeros((len(axis[3]), 1))], axis=-1)
+    q5 = turning[5]
+    columns = [turning[0], turning[1] - q5, turning[2] - q5, telescope, turning[7]]
+    return np.stack(columns, axis=-1)
+
+
+def damped_least_squares(jacobian: np.ndarray, task: np.ndarray, damping: float) -> np.ndarray:
+    """Joint rates (N, n) for task velocities (N, m) and Jacobians (N, m, n)."""
+    transposed = jacobian.transpose(0, 2, 1)
+    square = jacobian @ transposed + damping**2 * np.eye(task.shape[1])
+    return (transposed @ np.linalg.solve(square, task[:, :, None]))[:, :, 0]
+
+
+def half_turn(angle: np.ndarray) -> np.ndarray:
+    """The angle in [-pi/2, pi/2) that turns a log into the same place."""
+    return (angle + np.pi / 2) % np.pi - np.pi / 2
+
+
+def bounded(vector: np.ndarray, length: float) -> np.ndarray:
+    """vector (N, 3), shortened where it is longer than length."""
+    return vector / np.maximum(1.0, np.linalg.norm(vector, axis=-1, keepdims=True) / length)
+
+
+class ScriptedCrane:
+    """Maps observations (N, 18) to actions (N, 6). Its memory is that of one batch of trials."""
+
+    def __init__(self, signed_yaw: bool = True):
+        self.signed_yaw = signed_yaw
+        self.phase: np.ndarray | None = None  # (N,), begins with the first observation
+
+    def _start(self, cranes: int) -> None:
+        self.phase = np.full(cranes, APPROACH)
+        self.velocity = np.zeros((cranes, 3))  # commanded last, m/s
+        self.q7_goal = np.zeros(cranes)  # rad
+        self.log_yaw = None  # (N, 2) rad, where the log may lie by the first observation
+        self.doubt = np.zeros((cranes, 2))  # how badly either has predicted Delta_psi since
+
+    def _signed_angle(self, delta_psi: np.ndarray, grapple_axis: np.ndarray) -> np.ndarray:
+        """Angle to the log (N,) in rad from Delta_psi = 1 - |cos|, which hides its sign.
+
+        The first observation leaves two yaws for the log, and the rotator turns towards the first.
+        The yaw under which Delta_psi does not change as predicted is dropped, wherever the turn
+        came from: rotator, slew or swing.
+        """
+        cosine = (1 - delta_psi) / np.linalg.norm(grapple_axis[:, :2], axis=-1)  # undo the tilt
+        angle = np.arccos(np.clip(cosine, 0, 1))
+        grapple_yaw = np.arctan2(grapple_axis[:, 1], grapple_axis[:, 0])
+        if self.log_yaw is None:
+            self.log_yaw = grapple_yaw[:, None] + np.stack([angle, -angle], axis=-1)
+        predicted = half_turn(self.log_yaw - grapple_yaw[:, None])
+        self.doubt += np.abs(np.abs(predicted) - angle[:, None])
+        better = predicted[np.arange(len(angle)), self.doubt.argmin(axis=-1)]
+        return np.copysign(angle, better)
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        obs = np.asarray(obs, dtype=np.float64)
+        q, q8, q8_speed, delta_p = obs[:, :8], obs[:, 7], obs[:, 13], obs[:, 14:17]
+        if self.phase is None:
+            self._start(len(obs))
+        frames, plumb_frames = forward_kinematics(q), forward_kinematics(plumb(q))
+        p_plumb = grapple_centre(plumb_frames)
+        swing = grapple_centre(frames) - p_plumb
+        angle = obs[:, 17]
+        if not self.signed_yaw:
+            angle = self._signed_angle(angle, frames[-1, :, :3, 0])
+
+        # The rotator turns against yaw. A log looks the same after half a turn: keep to one goal
+        # until it nears the rotator's limit, which only a wrong sign of the angle can make it do.
+        goal = self.q7_goal + half_turn(q[:, 6] - angle - self.q7_goal)
+        self.q7_goal = np.where(np.abs(goal) > Q7_MAX, half_turn(goal), goal)
+        turn = q[:, 6] - self.q7_goal
+
+        away, height = np.linalg.norm(delta_p[:, :2], axis=-1), np.abs(delta_p[:, 2])
+        near = (away < NEAR) & (np.abs(turn) < NEARLY_ALIGNED)
+        in_place = (away < OVER) & (height < LEVEL) & (np.abs(turn) < ALIGNED)
+        gripped = (q8 > Q8_CLOSED) & (q8_speed < STALLED)
+        self.phase[(self.phase == APPROACH) & near] = DESCEND
+        self.phase[(self.phase == DESCEND) & in_place] = CLOSE
+        self.phase[(self.phase == CLOSE) & gripped] = LIFT
+        hovering, lifting = self.phase == APPROACH, self.phase == LIFT
+
+        # Delta_p,z is 0 where the jaws' tips just clear the ground, whatever the log's diameter.
+        way = delta_p + swing
+        way[hovering, 2] += HOVER
+        way[lifting] = 0.0
+        way[lifting, 2] = CARRY_HEIGHT - p_plumb[lifting, 2]
+        wanted = bounded(K_P * way, MAX_SPEED)
+        wanted[:, :2] += K_S * swing[:, :2]
+        self.velocity += bounded(wanted - self.velocity, MAX_ACCELERATION * DT)
+        yaw_rate = np.where(lifting, 0.0, K_YAW * turn)
+
+        task = np.concatenate([self.velocity, yaw_rate[:, None]], axis=-1)
+        rates = SPEED * damped_least_squares(plumb_jacobian(plumb_frames) * SPEED, task, DAMPING)
+        fractions = np.where(rates < 0, -rates / LOW, rates / HIGH)
+        # too fast for one joint: all slow down and the direction stays; the rotator may lag
+        fractions /= np.maximum(1.0, np.abs(fractions[:, :4]).max(axis=-1, keepdims=True))
+        jaws = np.where(self.phase >= CLOSE, 1.0, (Q8_OPEN - q8) / (DT * SPEEDS["real"][1, 5]))
+        return np.clip(np.concatenate([fractions, jaws[:, None]], axis=-1), -1.0, 1.0)
+
+
+@dataclass
+class Args:
+    trials: int = 20  # trials per log diameter
+    seed: int = 10_000  # seed of the trials
+    signed_yaw: bool = True  # observe the signed angle to the log, not the paper's Delta_psi
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args, description=__doc__)
+    diameters, seeds = monte_carlo_trials(args.seed, args.trials)
+    envs = CraneVectorEnv(len(seeds), diameter=diameters, signed_yaw=args.signed_yaw, env_threads=1)
+    obs, _ = envs.reset(seed=seeds)
+    act = ScriptedCrane(args.signed_yaw)
+    outcome = np.full(len(seeds), "", dtype=object)
+    for _ in range(envs.max_decisions):
+        obs, _, terminated, truncated, info = envs.advance(act(obs))
+        ended = (terminated | truncated) & (outcome == "")  # the first end of a trial counts
+        result = np.where(info["success"], "success", info["termination"])
+        outcome[ended] = result[ended]
+    for diameter in np.unique(diameters):
+        print(f"{diameter} m:", dict(Counter(outcome[diameters == diameter])))
