@@ -19,7 +19,7 @@ for, and its swing s = p_C - p_plumb is damped by letting the tip follow it:
     v = k_p (Delta_p + s + h) + k_s s     bounded in speed and acceleration
     s'' = -omega^2 s - x''                of the tip at x; with x' = k_s s its damping is k_s s'
 
-Phases, one a crane: APPROACH (over the log, turning along it), DESCEND, CLOSE, LIFT.
+Phases of each crane: APPROACH (over the log, turning along it), DESCEND, CLOSE, LIFT.
 
     python scripted_crane.py                       # 20 trials per log diameter, 10 s
     python scripted_crane.py --no-signed-yaw       # the angle's sign must be found by turning
@@ -50,13 +50,13 @@ DT = 0.1  # s, one decision
 LOW, HIGH = SPEEDS["real"][:, :5]  # speed limits of q1 ... q4, q7, rad/s and m/s
 SPEED = np.minimum(-LOW, HIGH)
 
-DAMPING = 0.1  # lambda, m/s at full joint speed; J's singular values there: 0.85 and more
+DAMPING = 0.1  # lambda, m/s at full joint speed; J's smallest singular value in the task: 0.85
 K_P = 1.5  # 1/s; half the pendulum's omega of 3 rad/s, so as not to drive it
-K_S = 2.5  # 1/s; adds k_s / (2 omega) = 0.4 to the damping ratio
+K_S = 2.5  # 1/s; adds k_s / (2 omega) = 0.4 to the damping ratio: swings of 0.27, not 0.32 rad
 MAX_SPEED = 2.0  # m/s; the longest ways, 6 m, then take 4 s
 MAX_ACCELERATION = 2.0  # m/s^2; leans the grapple by 0.2 rad, a quarter of what q6 allows
 K_YAW = 3.0  # 1/s; from pi/2 to 0.1 rad in one second
-Q7_MAX = 5 / 6 * np.pi  # rad; goals start within pi/2 and drift with the slew, by pi/3 at most
+Q7_MAX = np.pi / 2 + 0.2  # rad; goals start within pi/2, pose errors move them by 0.1 at most
 Q8_OPEN = 0.4  # rad; tips 2.2 m apart, and while hovering above a 0.8 m log
 HOVER = 0.4  # m above the closing height; the tips then pass over the log
 NEAR, NEARLY_ALIGNED = 0.5, 0.2  # m, rad; to descend: the tips stay clear of the log
@@ -136,16 +136,15 @@ class ScriptedCrane:
     def _start(self, cranes: int) -> None:
         self.phase = np.full(cranes, APPROACH)
         self.velocity = np.zeros((cranes, 3))  # commanded last, m/s
-        self.q7_goal = np.zeros(cranes)  # rad
+        self.q7_goal = np.zeros(cranes)  # rad, over the log
         self.log_yaw = None  # (N, 2) rad, where the log may lie by the first observation
         self.doubt = np.zeros((cranes, 2))  # how badly either has predicted Delta_psi since
 
     def _signed_angle(self, delta_psi: np.ndarray, grapple_axis: np.ndarray) -> np.ndarray:
-        """Angle to the log (N,) in rad from Delta_psi = 1 - |cos|, which hides its sign.
+        """Angle to the log (N,) in rad from Delta_psi (N,) = 1 - |cos|, which hides its sign.
 
-        The first observation leaves two yaws for the log, and the rotator turns towards the first.
-        The yaw under which Delta_psi does not change as predicted is dropped, wherever the turn
-        came from: rotator, slew or swing.
+        The first observation leaves two yaws for the log, and the rotator turns towards one of
+        them. Which of them Delta_psi has followed better since, that is the log's.
         """
         cosine = (1 - delta_psi) / np.linalg.norm(grapple_axis[:, :2], axis=-1)  # undo the tilt
         angle = np.arccos(np.clip(cosine, 0, 1))
@@ -163,17 +162,19 @@ class ScriptedCrane:
         if self.phase is None:
             self._start(len(obs))
         frames, plumb_frames = forward_kinematics(q), forward_kinematics(plumb(q))
-        p_plumb = grapple_centre(plumb_frames)
-        swing = grapple_centre(frames) - p_plumb
+        p_centre, p_plumb = grapple_centre(frames), grapple_centre(plumb_frames)
+        swing = p_centre - p_plumb
         angle = obs[:, 17]
         if not self.signed_yaw:
             angle = self._signed_angle(angle, frames[-1, :, :3, 0])
 
-        # The rotator turns against yaw. A log looks the same after half a turn: keep to one goal
-        # until it nears the rotator's limit, which only a wrong sign of the angle can make it do.
-        goal = self.q7_goal + half_turn(q[:, 6] - angle - self.q7_goal)
+        # The rotator turns against yaw, and against the slew to come. A log looks the same after
+        # half a turn: keep to one goal, in the middle of the rotator's range.
+        x, y, _ = (p_centre + delta_p).T
+        slew = np.arctan2(y, x) - np.arctan2(p_plumb[:, 1], p_plumb[:, 0])
+        goal = self.q7_goal + half_turn(q[:, 6] + slew - angle - self.q7_goal)
         self.q7_goal = np.where(np.abs(goal) > Q7_MAX, half_turn(goal), goal)
-        turn = q[:, 6] - self.q7_goal
+        turn = q[:, 6] + slew - self.q7_goal
 
         away, height = np.linalg.norm(delta_p[:, :2], axis=-1), np.abs(delta_p[:, 2])
         near = (away < NEAR) & (np.abs(turn) < NEARLY_ALIGNED)
@@ -197,7 +198,7 @@ class ScriptedCrane:
         task = np.concatenate([self.velocity, yaw_rate[:, None]], axis=-1)
         rates = SPEED * damped_least_squares(plumb_jacobian(plumb_frames) * SPEED, task, DAMPING)
         fractions = np.where(rates < 0, -rates / LOW, rates / HIGH)
-        # too fast for one joint: all slow down and the direction stays; the rotator may lag
+        # too fast for a joint: all slow down and the direction stays; the rotator alone is clipped
         fractions /= np.maximum(1.0, np.abs(fractions[:, :4]).max(axis=-1, keepdims=True))
         jaws = np.where(self.phase >= CLOSE, 1.0, (Q8_OPEN - q8) / (DT * SPEEDS["real"][1, 5]))
         return np.clip(np.concatenate([fractions, jaws[:, None]], axis=-1), -1.0, 1.0)
