@@ -250,7 +250,7 @@ def reward_terms(
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
     in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
-    before it: r_grapple (twice) pays for closing near the log, sharper than r_distance; r_lift
+    before it: r_grapple pays for closing near the log, sharper than r_distance; r_lift
     (twice) for a log lifted near its centre; r_balance (thrice) only while both jaws hold it,
     whatever is commanded to them. Why: README, errata.
     """
@@ -263,7 +263,7 @@ def reward_terms(
         r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
         r_balance = calm * (1 - r_lift)
     else:
-        r_grapple = 2 * r_distance**3 * closed
+        r_grapple = r_distance**3 * closed
         centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
         lift = r_distance * centred * np.clip(log_clearance(state), 0, 1)
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))

@@ -13,6 +13,7 @@ diameter and seed is always the same trial. Intervals are 95 % Wilson score inte
 
 import csv
 import json
+import os
 import sys
 import time
 from collections import Counter
@@ -77,7 +78,7 @@ class Args:
     camera: Literal["overview", "side", "grapple"] = "overview"
     """of the video"""
     width: int = 1280
-    """of the video [pixels], 16:9"""
+    """of the video [pixels], 16:9, at most 1920"""
     viewer: bool = False
     """show one trial after another in a window instead of evaluating"""
 
@@ -289,6 +290,11 @@ def main() -> None:
         raise SystemExit("--diameters needs at least one number")
     if args.video and args.video.suffix not in (".mp4", ".gif"):
         raise SystemExit(f"--video: {args.video} must end in .mp4 or .gif")
+    if not 64 <= args.width <= 1920:
+        raise SystemExit(f"--width must lie in [64, 1920], got {args.width}")
+    headless = not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if args.viewer and sys.platform == "linux" and headless:
+        raise SystemExit("--viewer needs a display, and DISPLAY is not set; use --video lift.mp4")
     for path in filter(None, (args.video, args.csv)):
         if not path.parent.is_dir():
             raise SystemExit(f"no folder {path.parent}; make it first")

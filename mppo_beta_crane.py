@@ -50,7 +50,7 @@ class Args:
     # --- experiment
     exp_name: str = "mppo_beta_crane"  # name of the run's folder
     seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 1_310_720  # decisions to train for, over all cranes
+    total_timesteps: int = 1_024_000  # decisions to train for, over all cranes, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads

@@ -149,6 +149,7 @@ def test_clear_errors(tmp_path):
     assert "no file nowhere.pt" in error_of("nowhere.pt")
     assert "at least one number" in error_of("--diameters")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
+    assert "--width must lie in" in error_of("--video", "lift.mp4", "--width", "4000")
     assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
     (tmp_path / "junk.pt").write_bytes(b"junk")
     assert "is no policy.pt of this repository" in error_of(tmp_path / "junk.pt")
