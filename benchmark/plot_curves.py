@@ -22,16 +22,18 @@ def column(rows: list[dict], x: str, y: str, scale: float) -> tuple[list[float],
 
 if __name__ == "__main__":
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
-    for k, path in enumerate(sorted((HERE / "curves").glob("*.csv"))):
+    scripts: list[str] = []  # one colour each, whatever the seed
+    for path in sorted((HERE / "curves").glob("*_seed*.csv")):
         with open(path) as file:
             rows = list(csv.DictReader(file))
-        color = f"C{k}"
+        script = path.stem.split("_seed")[0]
+        label = script if script not in scripts else None
+        scripts += [script] if label else []
+        color = f"C{scripts.index(script)}"
         for axis, x, scale in ((left, "decisions", 1e-6), (right, "wall_time_s", 1 / 60)):
             training = column(rows, x, "training_success_rate", scale)
             axis.plot(*training, color=color, alpha=0.35, linewidth=1)
-            axis.plot(
-                *column(rows, x, "eval_success_rate", scale), ".-", color=color, label=path.stem
-            )
+            axis.plot(*column(rows, x, "eval_success_rate", scale), ".-", color=color, label=label)
     left.set_xlabel("decisions [million]")
     right.set_xlabel("wall clock [min]")
     left.set_ylabel("success [%]")
