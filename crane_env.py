@@ -78,7 +78,7 @@ REACH_DISTANCE = 0.35  # m, bound of d_combine
 LOG_RANGE = 8.0  # m, between grapple centre and log centre
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
-CENTRED = 0.25  # m along the log, width of the staged reward's peak at the log's centre
+CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
 HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
 MAX_MISS = 0.3  # m along the log
@@ -249,10 +249,9 @@ def reward_terms(
     """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
-    in rad/s and m/s. kind "paper" is Sec. III-A2 as printed; "staged" unlocks each term by the one
-    before it: r_grapple pays for closing near the log, sharper than r_distance; r_lift
-    (twice) for a log lifted near its centre; r_balance (thrice) only while both jaws hold it,
-    whatever is commanded to them. Why: README, errata.
+    in rad/s and m/s. kind "paper" is Sec. III-A2 as printed. In "staged" r_grapple and r_lift
+    count only near the log and its centre, r_balance only while it is lifted and both jaws touch
+    it, whatever is commanded to them. Why: README, errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX

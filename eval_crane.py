@@ -300,6 +300,10 @@ def main() -> None:
             raise SystemExit(f"no folder {path.parent}; make it first")
     if not all(crane_env.D_MIN <= d <= crane_env.D_MAX for d in args.diameters):
         raise SystemExit(f"--diameters must lie in [0.3, 0.8] m, got {args.diameters}")
+    if args.policy != "scripted" and not args.signed_yaw:
+        raise SystemExit(
+            "--no-signed-yaw is for --policy scripted; a trained policy brings its own"
+        )
     if args.policy == "file":
         make_act, kwargs, name = load_policy(args.path, args.stochastic)
         source = str(args.path)

@@ -92,8 +92,8 @@ class Args:
     """what eps moves: action, a_n as in Eq. (robust ppo); rpo, the mean, in the update only"""
     perturbation: float = 0.1  # eps, half width of the perturbation of a_n
     anneal_perturbation: bool = True  # lower eps linearly to 0
-    log_excess_init: float = 1.5  # log(alpha - 1) = log(beta - 1) at the start
-    log_excess_max: float = 5.0  # bound of their magnitude
+    log_excess_init: float = 1.5  # log(alpha - 1) and log(beta - 1) at the start, before the bound
+    log_excess_max: float = 5.0  # bound, by a tanh, of log(alpha - 1) and log(beta - 1)
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
@@ -125,11 +125,11 @@ PAPER = Args(
     target_kl=None,
     anneal_perturbation=False,
     log_excess_init=0.0,
-    log_excess_max=3.5,  # a Beta narrower than the perturbation takes its samples for outliers
+    log_excess_max=3.5,  # a Beta narrower than a lasting perturbation takes it for outliers
 )
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, clip range, minibatch size, reward scale, weights of value loss and entropy, gradient bound,
-tanh units, no annealing, normalised observations and advantages, bounds of alpha, beta and a_n,
+tanh units, no annealing, normalised observations and advantages, alpha and beta (start, bounds), a_n,
 omega 1-3 = 1, z_l,d = 1 m, speed limits "real", start of an episode, its length (9 s, not 15 s)."""
 
 

@@ -74,7 +74,7 @@ class Args:
     # --- algorithm
     num_steps: int = 64  # decisions per crane and rollout
     hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
-    learning_rate: float = 1e-3  # Adam's step size
+    learning_rate: float = 7e-4  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
     gamma: float = 0.97  # discount per 0.1 s; other decision rates rescale it
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
@@ -113,6 +113,7 @@ PAPER = Args(
     anneal_lr=False,
     gamma=0.99,
     reward_scale=0.02,
+    log_std_init=-0.5,
     minibatch_size=2000,
     update_epochs=30,
     target_kl=None,

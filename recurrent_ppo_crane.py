@@ -119,6 +119,7 @@ PAPER = Args(
     anneal_lr=False,
     gamma=0.99,
     reward_scale=0.02,
+    log_std_init=-0.5,
     num_minibatches=21,
     update_epochs=30,
     target_kl=None,

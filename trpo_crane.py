@@ -123,6 +123,7 @@ PAPER = Args(
     anneal_lr=False,
     gamma=0.99,
     reward_scale=0.02,
+    log_std_init=-0.5,
     minibatch_size=2000,
     update_epochs=30,
 )

@@ -74,6 +74,22 @@ def test_shipped_policy_lifts_logs():
     assert json.loads(result.stdout)["mean_success_rate"] >= 0.75
 
 
+def test_scripted_crane_is_judged_like_a_policy():
+    for yaw in ("--signed-yaw", "--no-signed-yaw"):
+        result = run("--policy", "scripted", yaw, "--json", "--trials", "1", "--diameters", "0.5")
+        assert result.returncode == 0, result.stderr
+        assert json.loads(result.stdout)["mean_success_rate"] == 1
+
+
+def test_viewer_needs_a_display(monkeypatch):
+    monkeypatch.setattr(eval_crane.sys, "platform", "linux")
+    monkeypatch.setattr(eval_crane.sys, "argv", ["eval_crane.py", "--viewer"])
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(SystemExit, match="needs a display"):
+        eval_crane.main()
+
+
 def test_stochastic_and_sdf(monkeypatch):
     """Sampling changes the trials and the seed makes it repeatable; SDF contact runs."""
     diameters, seeds = crane_env.monte_carlo_trials(3, 2, (0.5,))
@@ -149,6 +165,7 @@ def test_clear_errors(tmp_path):
     assert "no file nowhere.pt" in error_of("nowhere.pt")
     assert "at least one number" in error_of("--diameters")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
+    assert "brings its own" in error_of("--no-signed-yaw")
     assert "--width must lie in" in error_of("--video", "lift.mp4", "--width", "4000")
     assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
     (tmp_path / "junk.pt").write_bytes(b"junk")

@@ -74,10 +74,11 @@ def test_log_probability_is_the_beta_density():
 
 def test_untrained_policy_is_as_wide_as_asked():
     torch.manual_seed(0)
-    agent = Agent(18, np.zeros(6), np.ones(6), Args(log_excess_init=math.log(3), log_excess_max=50))
+    agent = Agent(18, np.zeros(6), np.ones(6), Args(log_excess_init=1.5))
     distribution = agent.get_distribution(torch.randn(100, 18))
-    # alpha = beta = 4: variance 1 / (4 (alpha + beta + 1)) = 1 / 36
-    torch.testing.assert_close(distribution.stddev, torch.full((100, 6), 1 / 6), atol=5e-3, rtol=0)
+    alpha = 1 + math.exp(5 * math.tanh(1.5 / 5))
+    std = torch.full((100, 6), math.sqrt(1 / (4 * (2 * alpha + 1))))  # of a Beta with beta = alpha
+    torch.testing.assert_close(distribution.stddev, std, atol=5e-3, rtol=0)
 
 
 def test_mean_action_on_the_admissible_range():

@@ -93,8 +93,8 @@ def test_staged_reward():
     terms = crane_env.reward_terms(one_jaw, np.array([0.25]), COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [[r, 0.5 * r**3, 2 * 0.5 * r, 0.0]])
     high = state(log_centre=[4.0, 6.0, 3.2], grapple_centre=[4.0, 6.0, 3.2])
-    high = crane_env.reward_terms(high, np.array([0.25]), COMMAND)
-    np.testing.assert_allclose(high[0, 2], 2 * np.exp(-0.25))  # clearance counts up to 1 m
+    terms = crane_env.reward_terms(high, np.array([0.25]), COMMAND)
+    np.testing.assert_allclose(terms[0, 2], 2 * np.exp(-0.25))  # clearance counts up to 1 m
 
 
 def test_paper_reward():

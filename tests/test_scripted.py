@@ -54,8 +54,10 @@ def test_rates_do_the_task_where_trials_start():
     jacobian = plumb_jacobian(forward_kinematics(plumb(q))) * SPEED
     task = rng.normal(size=(200, 4))
     error = (jacobian @ damped_least_squares(jacobian, task, DAMPING)[:, :, None])[:, :, 0] - task
-    felt = np.linalg.norm(error, axis=-1) / np.linalg.norm(task, axis=-1)
-    assert np.all(felt < 0.014)  # lambda^2 / (sigma^2 + lambda^2), sigma > 0.85 as said there
+    relative_error = np.linalg.norm(error, axis=-1) / np.linalg.norm(task, axis=-1)
+    assert np.all(
+        relative_error < 0.014
+    )  # lambda^2 / (sigma^2 + lambda^2), sigma > 0.85 (see DAMPING)
 
 
 @pytest.mark.parametrize("angle", [-0.7, -0.3, 0.3, 0.7])

@@ -193,6 +193,10 @@ def test_paper_protocol(tmp_path, algorithm):
     assert args["offset"] == "minus" and not args["signed_yaw"]
     paper = module(algorithm).PAPER
     assert paper.num_envs == 42 and paper.num_steps == 1000 and paper.update_epochs == 30
+    assert paper.gamma == 0.99 and paper.reward_scale == 0.02
+    assert (
+        (paper.log_excess_init == 0) if algorithm == "mppo_beta" else (paper.log_std_init == -0.5)
+    )
 
 
 def start(algorithm, cwd, *arguments):
