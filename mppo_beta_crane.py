@@ -129,8 +129,9 @@ PAPER = Args(
 )
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, clip range, minibatch size, reward scale, weights of value loss and entropy, gradient bound,
-tanh units, no annealing, normalised observations and advantages, alpha and beta (start, bounds), a_n,
-omega 1-3 = 1, z_l,d = 1 m, speed limits "real", start of an episode, its length (9 s, not 15 s)."""
+tanh units, no annealing, normalised observations and advantages, alpha and beta at the start, their
+bounds and those of a_n, omega 1-3 = 1, z_l,d = 1 m, speed limits "real", start of an episode, its
+length (9 s, not 15 s)."""
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
