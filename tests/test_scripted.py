@@ -55,9 +55,8 @@ def test_rates_do_the_task_where_trials_start():
     task = rng.normal(size=(200, 4))
     error = (jacobian @ damped_least_squares(jacobian, task, DAMPING)[:, :, None])[:, :, 0] - task
     relative_error = np.linalg.norm(error, axis=-1) / np.linalg.norm(task, axis=-1)
-    assert np.all(
-        relative_error < 0.014
-    )  # lambda^2 / (sigma^2 + lambda^2), sigma > 0.85 (see DAMPING)
+    # at most lambda^2 / (sigma^2 + lambda^2), and sigma > 0.85 (see DAMPING)
+    assert np.all(relative_error < 0.014)
 
 
 @pytest.mark.parametrize("angle", [-0.7, -0.3, 0.3, 0.7])

@@ -194,9 +194,8 @@ def test_paper_protocol(tmp_path, algorithm):
     paper = module(algorithm).PAPER
     assert paper.num_envs == 42 and paper.num_steps == 1000 and paper.update_epochs == 30
     assert paper.gamma == 0.99 and paper.reward_scale == 0.02
-    assert (
-        (paper.log_excess_init == 0) if algorithm == "mppo_beta" else (paper.log_std_init == -0.5)
-    )
+    width = "log_excess_init" if algorithm == "mppo_beta" else "log_std_init"
+    assert getattr(paper, width) == {"log_excess_init": 0, "log_std_init": -0.5}[width]
 
 
 def start(algorithm, cwd, *arguments):
