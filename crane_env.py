@@ -120,6 +120,12 @@ def _choice(name: str, value: Any, allowed: Sequence) -> None:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
 
 
+def _count(name: str, value: Any) -> int:
+    if int(value) != value or value < 1:
+        raise ValueError(f"{name} must be a whole number of at least 1, got {value}")
+    return int(value)
+
+
 def load_model(
     contact: str = "primitive",
     integrator: str = "implicitfast",
@@ -139,8 +145,8 @@ def load_model(
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
-    spec.option.sdf_initpoints = sdf_initpoints
-    spec.option.sdf_iterations = sdf_iterations
+    spec.option.sdf_initpoints = _count("sdf_initpoints", sdf_initpoints)
+    spec.option.sdf_iterations = _count("sdf_iterations", sdf_iterations)
     if contact == "sdf":
         log_bit = spec.geom("log_capsule").contype
         for geom in spec.geoms:
@@ -340,7 +346,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     or "episode" (drawn once); it touches the observation only.
     diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
     may be assigned at any time and holds from the next start on.
-    contact, integrator, solver, sdf_initpoints, sdf_iterations: see `load_model`.
+    model_options: contact, integrator, solver, sdf_initpoints, sdf_iterations of `load_model`.
 
     Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
 
@@ -359,7 +365,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self,
         num_envs: int = 1,
         frame_skip: int = 20,
-        contact: str = "primitive",
         reward: str = "staged",
         speed: str = "real",
         offset: str = "plus",
@@ -370,28 +375,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         omega1: float = 1.0,
         omega2: float = 1.0,
         omega3: float = 1.0,
-        integrator: str = "implicitfast",
-        solver: str = "Newton",
-        sdf_initpoints: int = 8,
-        sdf_iterations: int = 5,
         env_threads: int = 0,
         render_mode: str | None = None,
         camera: str = "overview",
         width: int = 640,
         height: int = 480,
+        **model_options: Any,
     ):
-        counts = {"num_envs": num_envs, "frame_skip": frame_skip}
-        counts |= {"sdf_initpoints": sdf_initpoints, "sdf_iterations": sdf_iterations}
-        for name, value in counts.items():
-            if int(value) != value or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value}")
         _choice("reward", reward, ("staged", "paper"))
         _choice("speed", speed, tuple(SPEEDS))
         _choice("offset", offset, ("minus", "plus"))
         _choice("pose_noise", pose_noise, ("none", "step", "episode"))
         _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         _choice("camera", camera, ("overview", "side", "grapple"))
-        self.num_envs, self.frame_skip = int(num_envs), int(frame_skip)
+        self.num_envs = _count("num_envs", num_envs)
+        self.frame_skip = _count("frame_skip", frame_skip)
         self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
         self.speed, self.pose_noise = SPEEDS[speed], pose_noise
         self.omega1, self.omega2, self.omega3 = omega1, omega2, omega3
@@ -406,7 +404,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             if not np.all((D_MIN <= self.fixed_diameter) & (self.fixed_diameter <= D_MAX)):
                 raise ValueError(f"diameter must lie in [{D_MIN}, {D_MAX}] m, got {diameter}")
 
-        self.model = load_model(contact, integrator, solver, sdf_initpoints, sdf_iterations)
+        self.model = load_model(**model_options)
         self.batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
         self._bind(self.batch, self.model)
         self.dt = self.frame_skip * TIMESTEP
@@ -636,10 +634,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """RGB frames (height, width, 3), one a crane; "human" shows crane 0 in a window."""
-        if self.render_mode == "human":
-            self._show()
-        elif self.render_mode == "rgb_array":
+        if self.render_mode == "rgb_array":
             return tuple(self.render_crane(i) for i in range(self.num_envs))
+        if self.render_mode == "human":
+            import mujoco.viewer  # needs a display's libraries
+
+            if self._viewer is None:
+                self._viewer = mujoco.viewer.launch_passive(*self._scene(0))
+            with self._viewer.lock():
+                self._scene(0)
+            self._viewer.sync()
 
     def _scene(self, i: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Copies of crane i's model and data, always into the same two objects."""
@@ -654,15 +658,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self._renderer = mujoco.Renderer(model, *self._frame_size)
         self._renderer.update_scene(data, camera or self.camera)
         return self._renderer.render()
-
-    def _show(self) -> None:
-        import mujoco.viewer
-
-        if self._viewer is None:
-            self._viewer = mujoco.viewer.launch_passive(*self._scene(0))
-        with self._viewer.lock():
-            self._scene(0)
-        self._viewer.sync()
 
     @property
     def window_closed(self) -> bool:
@@ -694,18 +689,16 @@ class CraneEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
-        self._show()
+        if self.render_mode == "human":
+            self.render()
         return obs[0], {key: value[0] for key, value in info.items()}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.envs.advance(np.asarray(action)[None])
-        self._show()
-        info = {key: value[0] for key, value in info.items()}
-        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
-
-    def _show(self) -> None:
         if self.render_mode == "human":
             self.render()
+        info = {key: value[0] for key, value in info.items()}
+        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:
         frames = self.envs.render()
