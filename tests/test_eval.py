@@ -75,6 +75,9 @@ def test_shipped_policy_lifts_logs():
 
 
 def test_scripted_crane_is_judged_like_a_policy():
+    for signed in (True, False):  # environment and script must mean the same angle
+        make_act, kwargs, _ = eval_crane.fixed_policy("scripted", 0, signed)
+        assert kwargs["signed_yaw"] is signed and make_act().signed_yaw is signed
     for yaw in ("--signed-yaw", "--no-signed-yaw"):
         result = run("--policy", "scripted", yaw, "--json", "--trials", "1", "--diameters", "0.5")
         assert result.returncode == 0, result.stderr
