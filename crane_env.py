@@ -79,6 +79,7 @@ LOG_RANGE = 8.0  # m, between grapple centre and log centre
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
+LIFTED = 0.3  # m, clearance from which the staged r_lift counts in full
 HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
 MAX_MISS = 0.3  # m along the log
@@ -270,7 +271,7 @@ def reward_terms(
     else:
         r_grapple = r_distance**3 * closed
         centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
-        lift = r_distance * centred * np.clip(log_clearance(state), 0, 1)
+        lift = r_distance * centred * np.clip(log_clearance(state) / LIFTED, 0, 1)
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))
         held = state.touching.all(axis=-1)
         r_lift, r_balance = 2 * lift, 3 * calm * held * lift

@@ -78,9 +78,10 @@ class Args:
     hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
     learning_rate: float = 1e-3  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
-    gamma: float = 0.97  # discount per 0.1 s; other decision rates rescale it
+    gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
+    horizon_growth: float = 3.0  # of 1 / (1 - gamma) in the second half of the run, a factor
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: float = 0.06  # factor on the reward, per 0.1 s
+    reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: int = 1024  # decisions per gradient step
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
@@ -91,8 +92,9 @@ class Args:
     perturb: Literal["action", "none", "rpo"] = "action"
     """what eps moves: action, a_n as in Eq. (robust ppo); rpo, the mean, in the update only"""
     perturbation: float = 0.1  # eps, half width of the perturbation of a_n
-    anneal_perturbation: bool = True  # lower eps linearly to 0
+    anneal_perturbation: bool = True  # lower eps linearly to 0 in the first half of the run
     log_excess_init: float = 1.5  # log(alpha - 1) and log(beta - 1) at the start, before the bound
+    narrowing: float = 2.5  # both rise by this in the course of the run, beside what is learned
     log_excess_max: float = 5.0  # bound, by a tanh, of log(alpha - 1) and log(beta - 1)
 
     # --- reports
@@ -119,12 +121,14 @@ PAPER = Args(
     learning_rate=3e-4,
     anneal_lr=False,
     gamma=0.99,
+    horizon_growth=1.0,
     reward_scale=0.02,
     minibatch_size=2000,
     update_epochs=30,
     target_kl=None,
     anneal_perturbation=False,
     log_excess_init=0.0,
+    narrowing=0.0,
     log_excess_max=3.5,  # a Beta narrower than a lasting perturbation takes it for outliers
 )
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
@@ -324,8 +328,7 @@ if __name__ == "__main__":
         raise SystemExit("--minibatch-size leaves one sample alone, with no standard deviation")
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
-    gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
-    reward_scale = args.reward_scale * tenths
+    gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
     device = torch.device(args.device)
@@ -404,7 +407,14 @@ if __name__ == "__main__":
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
-            epsilon = args.perturbation * (fraction if args.anneal_perturbation else 1.0)
+            # first half of the run: to lift at all; second half: without haste
+            growth = args.horizon_growth ** max(0.0, 1 - 2 * fraction)
+            gamma = (1 - (1 - args.gamma) / growth) ** tenths
+            reward_scale = args.reward_scale * tenths / growth
+            with torch.no_grad():  # noise in joint speeds shakes the hanging grapple
+                agent.actor[-1].bias += args.narrowing / num_iterations
+            fading = max(0.0, 2 * fraction - 1) if args.anneal_perturbation else 1.0
+            epsilon = args.perturbation * fading
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
             cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit

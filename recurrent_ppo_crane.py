@@ -82,9 +82,10 @@ class Args:
     lstm_size: int = 64  # width of the memory that both read
     learning_rate: float = 7e-4  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
-    gamma: float = 0.97  # discount per 0.1 s; other decision rates rescale it
+    gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
+    horizon_growth: float = 3.0  # of 1 / (1 - gamma) in the second half of the run, a factor
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: float = 0.06  # factor on the reward, per 0.1 s
+    reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     num_minibatches: int = 4  # groups of cranes, each one gradient step on their whole rollouts
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
@@ -93,6 +94,7 @@ class Args:
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
     log_std_init: float = -1.2  # log sigma at the start [action units]
+    narrowing: float = 1.25  # it sinks by this in the course of the run, beside what is learned
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
@@ -118,8 +120,10 @@ PAPER = Args(
     learning_rate=3e-4,
     anneal_lr=False,
     gamma=0.99,
+    horizon_growth=1.0,
     reward_scale=0.02,
     log_std_init=-0.5,
+    narrowing=0.0,
     num_minibatches=21,
     update_epochs=30,
     target_kl=None,
@@ -334,8 +338,7 @@ if __name__ == "__main__":
     num_iterations = max(1, args.total_timesteps // batch_size)
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
-    gamma, gae_lambda = args.gamma**tenths, args.gae_lambda**tenths
-    reward_scale = args.reward_scale * tenths
+    gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
     device = torch.device(args.device)
@@ -414,6 +417,12 @@ if __name__ == "__main__":
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
+            # first half of the run: to lift at all; second half: without haste
+            growth = args.horizon_growth ** max(0.0, 1 - 2 * fraction)
+            gamma = (1 - (1 - args.gamma) / growth) ** tenths
+            reward_scale = args.reward_scale * tenths / growth
+            with torch.no_grad():  # noise in joint speeds shakes the hanging grapple
+                agent.log_std -= args.narrowing / num_iterations
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
             cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit

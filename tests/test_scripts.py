@@ -192,6 +192,7 @@ def test_paper_protocol(tmp_path, algorithm):
     assert args["integrator"] == "implicit" and args["solver"] == "CG" and args["num_envs"] == 2
     assert args["offset"] == "minus" and not args["signed_yaw"]
     paper = module(algorithm).PAPER
+    assert paper.horizon_growth == 1 and paper.narrowing == 0
     assert paper.num_envs == 42 and paper.num_steps == 1000 and paper.update_epochs == 30
     assert paper.gamma == 0.99 and paper.reward_scale == 0.02
     width = "log_excess_init" if algorithm == "mppo_beta" else "log_std_init"
@@ -289,7 +290,10 @@ def test_help_explains_every_argument(tmp_path, algorithm):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm):
-    """1 for ever, cut every 5 steps: V = 1 / (1 - 0.9) = 10; 4.1 if a cut were an end."""
+    """1 for ever, cut every 5 steps: V = 1 / (1 - 0.9) = 10; 4.1 if a cut were an end.
+
+    It stays 10 while the horizon grows to 30 steps, for the reward falls to 1 / 3.
+    """
     arguments = "--env-id recall_env:Endless-v0 --num-envs 16 --num-steps 18 --gamma 0.9"
     arguments += " --hidden-sizes 16 --learning-rate 1e-2 --reward-scale 1 --eval-every 0"
     arguments += " --final-trials 0 --torch-threads 1 --total-timesteps 43200 --max-grad-norm 10"
@@ -304,8 +308,24 @@ def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm):
     assert agent.get_value(obs).item() == pytest.approx(10, abs=1)
 
 
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_exploration_narrows_along_the_run(tmp_path, algorithm):
+    """Where nothing is learned, the width ends at its start and the whole of narrowing."""
+    nothing = "--learning-rate 0 --max-kl 1e-12" if algorithm == "trpo" else "--learning-rate 0"
+    arguments = f"--total-timesteps 192 --narrowing 0.6 --eval-every 0 {nothing}"
+    run(algorithm, tmp_path, *small(algorithm), *arguments.split())
+    saved = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)
+    if algorithm == "mppo_beta":
+        width, expected = saved["weights"]["actor.4.bias"], saved["args"]["log_excess_init"] + 0.6
+    else:
+        width, expected = saved["weights"]["log_std"], saved["args"]["log_std_init"] - 0.6
+    torch.testing.assert_close(width, torch.full_like(width, expected), rtol=0, atol=1e-4)
+
+
 RECALL = "--env-id recall_env:Recall-v0 --num-envs 16 --num-steps 18 --update-epochs 4 --gamma 1"
-RECALL += " --hidden-sizes 32 --learning-rate 3e-3 --reward-scale 1 --eval-every 0"
+RECALL += (
+    " --hidden-sizes 32 --learning-rate 3e-3 --reward-scale 1 --horizon-growth 1 --eval-every 0"
+)
 RECALL += " --final-trials 50 --torch-threads 1 --total-timesteps 25600"
 
 
