@@ -15,6 +15,10 @@ The rest is PPO (Schulman et al., 2017), with generalised advantage estimation:
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
+Three more things change along a run (why: benchmark/README.md). Exploration narrows by itself, for
+noise in joint speeds shakes the hanging grapple. The step size falls to 0. In the second half the
+horizon 1 / (1 - gamma) grows: a short one soon learns to lift, a long one takes time over its grip.
+
     python mppo_beta_crane.py                      # the forestry crane, minutes on two cores
     python mppo_beta_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9   # any Box/Box task
     python mppo_beta_crane.py --resume runs/<run>/checkpoint.pt

@@ -21,6 +21,10 @@ With generalised advantage estimation:
                                                    A_{t+1} is 0 where an episode ended
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
+Three more things change along a run (why: benchmark/README.md). Exploration narrows by itself, for
+noise in joint speeds shakes the hanging grapple. The step size falls to 0. In the second half the
+horizon 1 / (1 - gamma) grows: a short one soon learns to lift, a long one takes time over its grip.
+
     python trpo_crane.py                      # the forestry crane, minutes on two cores
     python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8   # any Box/Box task
     python trpo_crane.py --resume runs/<run>/checkpoint.pt

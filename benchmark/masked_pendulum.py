@@ -27,7 +27,7 @@ COLUMNS = ["algorithm", "seed", "steps", "mean_return"]
 EPISODES = 20
 COMMON = """--env-id masked_pendulum:MaskedPendulum-v1 --num-envs 32 --num-steps 128 --gamma 0.9
 --reward-scale 0.1 --learning-rate 1e-3 --update-epochs 10 --hidden-sizes 64 64 --log-std-init 0
---eval-every 5"""
+--horizon-growth 1 --eval-every 5"""
 OWN = {"ppo": "--minibatch-size 512", "recurrent_ppo": "--num-minibatches 8"}
 
 
