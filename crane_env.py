@@ -63,6 +63,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch, SimulationError
+from numpy.random import Generator, SeedSequence, default_rng
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
@@ -79,7 +80,6 @@ LOG_RANGE = 8.0  # m, between grapple centre and log centre
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
-LIFTED = 0.3  # m, clearance from which the staged r_lift counts in full
 HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
 MAX_MISS = 0.3  # m along the log
@@ -98,22 +98,21 @@ LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
 TERMINATIONS = np.array(  # the first that applies counts
     "none diverged joint_limit overspeed log_too_far not_reached time_limit".split()
 )
-
-
-Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+Array = np.ndarray
+Step = tuple[Array, Array, Array, Array, dict[str, Any]]
 
 
 class CraneState(NamedTuple):
     """What observation, reward and rules are computed from, for N cranes."""
 
-    q: np.ndarray  # (N, 8) joint positions, rad and m
-    dq: np.ndarray  # (N, 6) velocities of the actuated joints
-    grapple_centre: np.ndarray  # (N, 3) p_C, m
-    grapple_axis: np.ndarray  # (N, 3) e_C,x, unit
-    log_centre: np.ndarray  # (N, 3) p_l, m
-    log_axis: np.ndarray  # (N, 3) along the log, unit
-    touching: np.ndarray  # (N, 2) bool, outer and inner jaw on the log
-    diameter: np.ndarray  # (N,) m
+    q: Array  # (N, 8) joint positions, rad and m
+    dq: Array  # (N, 6) velocities of the actuated joints
+    grapple_centre: Array  # (N, 3) p_C, m
+    grapple_axis: Array  # (N, 3) e_C,x, unit
+    log_centre: Array  # (N, 3) p_l, m
+    log_axis: Array  # (N, 3) along the log, unit
+    touching: Array  # (N, 2) bool, outer and inner jaw on the log
+    diameter: Array  # (N,) m
 
 
 def _choice(name: str, value: Any, allowed: Sequence) -> None:
@@ -160,7 +159,7 @@ def load_model(
     return spec.compile()
 
 
-def tip_position(q2: np.ndarray, q3: np.ndarray, q4: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
     """Distance of the tip joint from the slew axis and its height, both in m (DH parameters)."""
     arm = 3.157 + 2 * q4
     out = -0.18 + 3.49288 * np.cos(q2) - 0.3925 * np.cos(q2 + q3) + arm * np.sin(q2 + q3)
@@ -168,23 +167,18 @@ def tip_position(q2: np.ndarray, q3: np.ndarray, q4: np.ndarray) -> tuple[np.nda
     return out, up
 
 
-def sample_start(
-    rng: np.random.Generator, difficulty: float = 1.0
-) -> tuple[np.ndarray, np.ndarray, float]:
+def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array, float]:
     """Draw one start: q (8,), log pose (x, y, yaw) in m and rad, log diameter in m.
 
     difficulty 1 is the full task. Smaller values draw the same start and then move the log towards
     a point under the grapple, its yaw towards the grapple's, its diameter towards the mean one.
     """
-    while True:
-        candidates = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3))
-        q2, q3, q4 = candidates.T
+    good = np.zeros(1, bool)
+    while not good.any():
+        q2, q3, q4 = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3)).T
         out, up = tip_position(q2, q3, q4)
         good = (4.5 <= out) & (out <= 8) & (2.7 <= up) & (up <= 4.2) & (q2 + q3 > 0.05)
-        if good.any():
-            break
-    first = np.argmax(good)
-    (q2, q3, q4), out = candidates[first], out[first]
+    q2, q3, q4, out = np.stack([q2, q3, q4, out])[:, np.argmax(good)]
     q1, azimuth = rng.uniform(-2 * np.pi / 3, -np.pi / 3, size=2)
     swing5, swing6 = rng.uniform(-0.05, 0.05, size=2)
     q7, yaw = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
@@ -203,7 +197,7 @@ def sample_start(
 
 def relative_pose(
     state: CraneState, offset: str = "plus", signed_yaw: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Array, Array, Array]:
     """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], and what is observed of the angle, (N,).
 
     Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
@@ -224,35 +218,33 @@ def relative_pose(
     return delta_p, delta_psi, angle
 
 
-def noisy_pose(
-    delta_p: np.ndarray, angle: np.ndarray, epsilon: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
     """Pose measurement errors of Sec. IV-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
     decay = np.sum(delta_p**2, axis=-1) / POSE_RANGE**2  # s(Delta_p)
     noisy_delta_p = delta_p * (1 + epsilon[:, :1] * decay[:, None])
     return noisy_delta_p, angle * (1 + epsilon[:, 1] * decay)
 
 
-def log_clearance(state: CraneState) -> np.ndarray:
+def log_clearance(state: CraneState) -> Array:
     """Height of the lowest point of the log above the ground, (N,) in m."""
     up = np.minimum(np.abs(state.log_axis[:, 2]), 1.0)
     below_centre = LOG_LENGTH / 2 * up + state.diameter / 2 * np.sqrt(1 - up**2)
     return state.log_centre[:, 2] - below_centre
 
 
-def centre_miss(state: CraneState) -> np.ndarray:
+def centre_miss(state: CraneState) -> Array:
     """Distance from the log's centre to p_C, measured along the log, (N,) in m."""
     return np.abs(np.sum((state.grapple_centre - state.log_centre) * state.log_axis, axis=-1))
 
 
 def reward_terms(
     state: CraneState,
-    d_combine: np.ndarray,
-    command: np.ndarray,
+    d_combine: Array,
+    command: Array,
     kind: str = "staged",
     omega2: float = 1.0,
     omega3: float = 1.0,
-) -> np.ndarray:
+) -> Array:
     """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
 
     d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
@@ -271,7 +263,7 @@ def reward_terms(
     else:
         r_grapple = r_distance**3 * closed
         centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
-        lift = r_distance * centred * np.clip(log_clearance(state) / LIFTED, 0, 1)
+        lift = r_distance * centred * np.sqrt(np.clip(log_clearance(state), 0, 1))
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))
         held = state.touching.all(axis=-1)
         r_lift, r_balance = 2 * lift, 3 * calm * held * lift
@@ -279,19 +271,14 @@ def reward_terms(
 
 
 def termination_rule(
-    state: CraneState,
-    time: np.ndarray,
-    reached: np.ndarray,
-    diverged: np.ndarray,
-    joint_range: np.ndarray,
-    speed: np.ndarray,
-) -> np.ndarray:
+    state: CraneState, time: Array, reached: Array, diverged: Array, limits: Array, speed: Array
+) -> Array:
     """Index into TERMINATIONS of the rule that ends each episode, 0 where it goes on, (N,).
 
-    time (N,) in s since the start, reached (N,) bool, joint_range (8, 2) and speed (2, 6), as in
-    SPEEDS, in rad, m and s.
+    time (N,) in s since the start, reached (N,) bool, limits (8, 2) of the joints and speed (2, 6),
+    as in SPEEDS, in rad, m and s.
     """
-    q, (low, high) = state.q[:, LIMITED], joint_range[LIMITED].T
+    q, (low, high) = state.q[:, LIMITED], limits[LIMITED].T
     distance = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
     rules = [
         diverged,
@@ -305,8 +292,8 @@ def termination_rule(
 
 
 def success_conditions(
-    reached: np.ndarray, clearance: np.ndarray, touching: np.ndarray, miss: np.ndarray
-) -> dict[str, np.ndarray]:
+    reached: Array, clearance: Array, touching: Array, miss: Array
+) -> dict[str, Array]:
     """The one definition of success, for training, evaluation and tests: (N,) bool each.
 
     reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. The others hold the W
@@ -324,17 +311,13 @@ def success_conditions(
 
 def monte_carlo_trials(
     seed: int, trials: int, diameters: Sequence[float] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-) -> tuple[np.ndarray, list[np.random.SeedSequence]]:
+) -> tuple[Array, list[SeedSequence]]:
     """Diameters (m) and seeds of trials per diameter, for `CraneVectorEnv` and its `reset`.
 
     Trial k at a diameter is the same whatever the number of trials and the other diameters.
     """
-    seeds = [
-        np.random.SeedSequence(seed, spawn_key=(round(1000 * d), k))
-        for d in diameters
-        for k in range(trials)
-    ]
-    return np.repeat(diameters, trials), seeds
+    keys = [(round(1000 * d), k) for d in diameters for k in range(trials)]
+    return np.repeat(diameters, trials), [SeedSequence(seed, spawn_key=key) for key in keys]
 
 
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
@@ -371,7 +354,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         offset: str = "plus",
         signed_yaw: bool = False,
         pose_noise: str = "none",
-        diameter: float | np.ndarray | None = None,
+        diameter: float | Array | None = None,
         difficulty: float = 1.0,
         omega1: float = 1.0,
         omega2: float = 1.0,
@@ -418,14 +401,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._last_miss = np.zeros((self.num_envs, window))
         self._last_touching = np.zeros((self.num_envs, window, 2), bool)
         self._noise = np.zeros((self.num_envs, self.max_decisions + 1, 2))
-        self._rngs: list[tuple[np.random.Generator, np.random.Generator]] | None = None
+        self._rngs: list[tuple[Generator, Generator]] | None = None
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
         bound = np.concatenate([np.full(6, 10.0), np.full(3, 20.0), [np.pi / 2]])
-        self.single_observation_space = gymnasium.spaces.Box(
-            np.concatenate([low, -bound]).astype(np.float32),
-            np.concatenate([high, bound]).astype(np.float32),
-        )
+        bounds = np.float32([[*low, *-bound], [*high, *bound]])
+        self.single_observation_space = gymnasium.spaces.Box(*bounds)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -457,11 +438,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._max_lead = force_limit / self._servo_kp
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | np.random.SeedSequence] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | SeedSequence] | None = None, options: dict | None = None
+    ) -> tuple[Array, dict[str, Any]]:
         """Start a new episode in every crane.
 
         seed: one for all (crane i then draws from its i-th child), or one per crane.
@@ -469,20 +447,18 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self._rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
-                seeds = np.random.SeedSequence(seed).spawn(self.num_envs)
+                seeds = SeedSequence(seed).spawn(self.num_envs)
             else:
-                sequence = np.random.SeedSequence
-                seeds = [s if isinstance(s, sequence) else sequence(s) for s in seed]
+                seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
             # starts and pose noise have streams of their own: noise leaves the starts as they are
-            rng = np.random.default_rng
-            self._rngs = [(rng(s), rng(s.generate_state(4))) for s in seeds]
+            self._rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
         self._start_episodes(np.arange(self.num_envs))
         state = self._state()
         return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
 
-    def step(self, actions: np.ndarray) -> Step:
+    def step(self, actions: Array) -> Step:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
@@ -497,7 +473,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             obs[ended] = self._observe(self._state())[ended]
         return obs, reward, terminated, truncated, info
 
-    def advance(self, actions: np.ndarray) -> Step:
+    def advance(self, actions: Array) -> Step:
         """`step` without autoreset: an ended episode stays where it ended."""
         if self._rngs is None:
             raise RuntimeError("call reset() before step()")
@@ -517,24 +493,22 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.where(reach, np.minimum(self._reach_time, time), self._reach_time)
         reached = np.isfinite(self._reach_time)
-        column = self._decisions % self._last_miss.shape[1]
-        cranes = np.arange(self.num_envs)
-        self._last_clearance[cranes, column] = info["clearance"]
-        self._last_miss[cranes, column] = info["centre_miss"]
-        self._last_touching[cranes, column] = state.touching
+        now = np.arange(self.num_envs), self._decisions % self._last_miss.shape[1]
+        self._last_clearance[now] = info["clearance"]
+        self._last_miss[now] = info["centre_miss"]
+        self._last_touching[now] = state.touching
 
         rule = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         truncated = TERMINATIONS[rule] == "time_limit"
-        conditions = success_conditions(
-            reached, self._last_clearance, self._last_touching, self._last_miss
-        )
+        last = self._last_clearance, self._last_touching, self._last_miss
+        conditions = success_conditions(reached, *last)
         conditions["success"] &= truncated
         info |= conditions | {"termination": TERMINATIONS[rule], "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
         reward = np.where(diverged, 0.0, reward)
         return self._observe(state), reward, (rule > 0) & ~truncated, truncated, info
 
-    def _simulate(self, command: np.ndarray) -> np.ndarray:
+    def _simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
         self._ctrl[:, :8] = self._ctrl[:, 8:] = command
         failed = np.zeros(self.num_envs, bool)
@@ -552,7 +526,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         finite = np.isfinite(self._qpos).all(axis=-1) & np.isfinite(self._qvel).all(axis=-1)
         return failed | warned | ~finite
 
-    def _start_episodes(self, ids: np.ndarray) -> None:
+    def _start_episodes(self, ids: Array) -> None:
         """Draw new starts for the cranes `ids`."""
         starts = []
         for i in ids:
@@ -566,9 +540,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
 
-    def place(
-        self, ids: np.ndarray, q: np.ndarray, log_pose: np.ndarray, diameter: np.ndarray
-    ) -> None:
+    def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self.batch.warning[ids] = 0
@@ -611,7 +583,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             diameter=self._diameter.copy(),
         )
 
-    def _observe(self, state: CraneState) -> np.ndarray:
+    def _observe(self, state: CraneState) -> Array:
         """Observations (N, 18), float32, inside the observation space."""
         delta_p, _, angle = relative_pose(state, self.offset, self.signed_yaw)
         if self.pose_noise != "none":
@@ -622,7 +594,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         space = self.single_observation_space
         return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32)
 
-    def _info(self, state: CraneState, command: np.ndarray) -> dict[str, np.ndarray]:
+    def _info(self, state: CraneState, command: Array) -> dict[str, Array]:
         delta_p, delta_psi, _ = relative_pose(state, self.offset)
         d_combine = np.linalg.norm(delta_p, axis=-1) + self.omega1 * delta_psi
         terms = reward_terms(state, d_combine, command, self.reward, self.omega2, self.omega3)
@@ -633,7 +605,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "centre_miss": centre_miss(state),
         }
 
-    def render(self) -> tuple[np.ndarray, ...] | None:
+    def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), one a crane; "human" shows crane 0 in a window."""
         if self.render_mode == "rgb_array":
             return tuple(self.render_crane(i) for i in range(self.num_envs))
@@ -652,7 +624,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._scene_data = self.batch.get_data(i, self._scene_data)
         return self._scene_model, self._scene_data
 
-    def render_crane(self, i: int, camera: str | None = None) -> np.ndarray:
+    def render_crane(self, i: int, camera: str | None = None) -> Array:
         """RGB frame (height, width, 3), uint8, of crane i; cameras: overview, side, grapple."""
         model, data = self._scene(i)
         if self._renderer is None:
@@ -666,10 +638,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return self._viewer is not None and not self._viewer.is_running()
 
     def close_extras(self, **kwargs: Any) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-        if self._viewer is not None:
-            self._viewer.close()
+        for window in (self._renderer, self._viewer):
+            if window is not None:
+                window.close()
         self._renderer = self._viewer = None
 
 
@@ -687,21 +658,21 @@ class CraneEnv(gymnasium.Env):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
         if self.render_mode == "human":
             self.render()
         return obs[0], {key: value[0] for key, value in info.items()}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.envs.advance(np.asarray(action)[None])
         if self.render_mode == "human":
             self.render()
         info = {key: value[0] for key, value in info.items()}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
-    def render(self) -> np.ndarray | None:
+    def render(self) -> Array | None:
         frames = self.envs.render()
         return None if frames is None else frames[0]
 

@@ -5,6 +5,7 @@ The paper's own algorithm (Vu et al., Sec. III-B). Three things set it apart fro
 - a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, on the admissible range of each action:
   a = low + (high - low) a_n, so no probability is lost outside the limits (Chou et al., 2017);
 - while training, the sampled action is perturbed, a_n <- clip(a_n + g, 0, 1), g ~ U(-eps, eps);
+  here eps falls to 0 in the first half of the run;
 - its mean, alpha / (alpha + beta), acts when the policy is evaluated.
 
 The rest is PPO (Schulman et al., 2017), with generalised advantage estimation:
@@ -15,12 +16,12 @@ The rest is PPO (Schulman et al., 2017), with generalised advantage estimation:
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
-Three more things change along a run (why: benchmark/README.md). Exploration narrows by itself, for
-noise in joint speeds shakes the hanging grapple. The step size falls to 0. In the second half the
-horizon 1 / (1 - gamma) grows: a short one soon learns to lift, a long one takes time over its grip.
+Three things change along a run (why: benchmark/README.md). Exploration narrows by itself, for noise
+in joint speeds shakes the hanging grapple. The horizon 1 / (1 - gamma) grows, for a short one soon
+learns to lift and a long one takes time over its grip. The step size falls to 0.
 
     python mppo_beta_crane.py                      # the forestry crane, minutes on two cores
-    python mppo_beta_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9   # any Box/Box task
+    python mppo_beta_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9 --horizon-growth 1
     python mppo_beta_crane.py --resume runs/<run>/checkpoint.pt
 """
 
@@ -83,7 +84,7 @@ class Args:
     learning_rate: float = 1e-3  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
     gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
-    horizon_growth: float = 3.0  # of 1 / (1 - gamma) in the second half of the run, a factor
+    horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run; 1: it stays
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: int = 1024  # decisions per gradient step
@@ -98,7 +99,7 @@ class Args:
     perturbation: float = 0.1  # eps, half width of the perturbation of a_n
     anneal_perturbation: bool = True  # lower eps linearly to 0 in the first half of the run
     log_excess_init: float = 1.5  # log(alpha - 1) and log(beta - 1) at the start, before the bound
-    narrowing: float = 2.5  # both rise by this in the course of the run, beside what is learned
+    narrowing: float = 2.5  # by which both rise along the run, whatever is learned; 0: they do not
     log_excess_max: float = 5.0  # bound, by a tanh, of log(alpha - 1) and log(beta - 1)
 
     # --- reports
@@ -316,6 +317,7 @@ if __name__ == "__main__":
             machine = {name: getattr(args, name) for name in MACHINE_ARGS}
             args = Args(**{**checkpoint["args"], **machine})
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
+            ours &= checkpoint["args"].keys() == asdict(args).keys()  # those of this revision
         except Exception:
             ours = False
         if not ours:
@@ -325,6 +327,8 @@ if __name__ == "__main__":
         print(PAPER_GUESSES)
     if min(args.num_envs, args.num_steps, args.minibatch_size) < 1:
         raise SystemExit("--num-envs, --num-steps and --minibatch-size must be at least 1")
+    if args.horizon_growth < 1:
+        raise SystemExit("--horizon-growth must be at least 1, which keeps gamma as it is")
     batch_size = args.num_envs * args.num_steps
     num_minibatches = -(-batch_size // args.minibatch_size)
     num_iterations = max(1, args.total_timesteps // batch_size)
@@ -332,7 +336,6 @@ if __name__ == "__main__":
         raise SystemExit("--minibatch-size leaves one sample alone, with no standard deviation")
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
-    gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
     device = torch.device(args.device)
@@ -411,12 +414,11 @@ if __name__ == "__main__":
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
-            # first half of the run: to lift at all; second half: without haste
-            growth = args.horizon_growth ** max(0.0, 1 - 2 * fraction)
+            # the horizon grows after the first quarter, the reward shrinks alike: V keeps its size
+            growth = args.horizon_growth ** max(0.0, 1 - fraction / 0.75)
             gamma = (1 - (1 - args.gamma) / growth) ** tenths
+            gae_lambda = args.gae_lambda**tenths
             reward_scale = args.reward_scale * tenths / growth
-            with torch.no_grad():  # noise in joint speeds shakes the hanging grapple
-                agent.actor[-1].bias += args.narrowing / num_iterations
             fading = max(0.0, 2 * fraction - 1) if args.anneal_perturbation else 1.0
             epsilon = args.perturbation * fading
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
@@ -517,11 +519,13 @@ if __name__ == "__main__":
                 boundary = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
                 stats["policy/alpha"] = [policy.concentration1.mean().item()]
                 stats["policy/beta"] = [policy.concentration0.mean().item()]
+                stats["policy/perturbation"] = [epsilon]
                 stats["policy/boundary_frac"] = [boundary.float().mean().item()]
                 residual_var = (b_returns - values.flatten()).var()
                 stats["losses/explained_variance"] = [(1 - residual_var / b_returns.var()).item()]
                 # only now, so that rollout and update have seen the same policy
                 agent.update_normalizer(b_obs)
+                agent.actor[-1].bias += args.narrowing / num_iterations
             completed = iteration
 
             # ---- reports
@@ -529,6 +533,7 @@ if __name__ == "__main__":
             sps = (iteration - first_iteration + 1) * batch_size / (now - start_time)
             report = {name: np.mean(values) for name, values in stats.items()}
             report["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
+            report["charts/gamma"] = gamma
             report["charts/updates"] = iteration
             report["charts/SPS"] = sps
             report["time/rollout"] = update_start - rollout_start

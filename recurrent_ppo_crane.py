@@ -17,9 +17,9 @@ With generalised advantage estimation:
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
     rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
-Three more things change along a run (why: benchmark/README.md). Exploration narrows by itself, for
-noise in joint speeds shakes the hanging grapple. The step size falls to 0. In the second half the
-horizon 1 / (1 - gamma) grows: a short one soon learns to lift, a long one takes time over its grip.
+Three things change along a run (why: benchmark/README.md). Exploration narrows by itself, for noise
+in joint speeds shakes the hanging grapple. The horizon 1 / (1 - gamma) grows, for a short one soon
+learns to lift and a long one takes time over its grip. The step size falls to 0.
 
     python recurrent_ppo_crane.py                      # the forestry crane, on two cores
     python recurrent_ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8   # any Box/Box task
@@ -87,7 +87,7 @@ class Args:
     learning_rate: float = 7e-4  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
     gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
-    horizon_growth: float = 3.0  # of 1 / (1 - gamma) in the second half of the run, a factor
+    horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run; 1: it stays
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     num_minibatches: int = 4  # groups of cranes, each one gradient step on their whole rollouts
@@ -98,7 +98,7 @@ class Args:
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
     log_std_init: float = -1.2  # log sigma at the start [action units]
-    narrowing: float = 1.25  # it sinks by this in the course of the run, beside what is learned
+    narrowing: float = 1.25  # by which it sinks along the run, whatever is learned; 0: it does not
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
@@ -323,6 +323,7 @@ if __name__ == "__main__":
             machine = {name: getattr(args, name) for name in MACHINE_ARGS}
             args = Args(**{**checkpoint["args"], **machine})
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
+            ours &= checkpoint["args"].keys() == asdict(args).keys()  # those of this revision
         except Exception:
             ours = False
         if not ours:
@@ -336,13 +337,14 @@ if __name__ == "__main__":
         raise SystemExit(
             "--num-envs must be a multiple of --num-minibatches: cranes are shared out"
         )
+    if args.horizon_growth < 1:
+        raise SystemExit("--horizon-growth must be at least 1, which keeps gamma as it is")
     batch_size = args.num_envs * args.num_steps
     if batch_size // args.num_minibatches < 2:
         raise SystemExit("--num-minibatches leaves one sample alone, with no standard deviation")
     num_iterations = max(1, args.total_timesteps // batch_size)
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
-    gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
     device = torch.device(args.device)
@@ -421,12 +423,11 @@ if __name__ == "__main__":
             fraction = 1.0 - (iteration - 1.0) / num_iterations
             if args.anneal_lr:
                 optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
-            # first half of the run: to lift at all; second half: without haste
-            growth = args.horizon_growth ** max(0.0, 1 - 2 * fraction)
+            # the horizon grows after the first quarter, the reward shrinks alike: V keeps its size
+            growth = args.horizon_growth ** max(0.0, 1 - fraction / 0.75)
             gamma = (1 - (1 - args.gamma) / growth) ** tenths
+            gae_lambda = args.gae_lambda**tenths
             reward_scale = args.reward_scale * tenths / growth
-            with torch.no_grad():  # noise in joint speeds shakes the hanging grapple
-                agent.log_std -= args.narrowing / num_iterations
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
             cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
@@ -531,6 +532,7 @@ if __name__ == "__main__":
                 stats["losses/explained_variance"] = [(1 - residual_var / returns.var()).item()]
                 # only now, so that rollout and update have seen the same policy
                 agent.update_normalizer(obs.flatten(0, 1))
+                agent.log_std -= args.narrowing / num_iterations
             completed = iteration
 
             # ---- reports
@@ -538,6 +540,7 @@ if __name__ == "__main__":
             sps = (iteration - first_iteration + 1) * batch_size / (now - start_time)
             report = {name: np.mean(values) for name, values in stats.items()}
             report["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
+            report["charts/gamma"] = gamma
             report["charts/updates"] = iteration
             report["charts/SPS"] = sps
             report["time/rollout"] = update_start - rollout_start

@@ -92,7 +92,8 @@ def train_ours(task: str, algorithm: str, seed: int):
         flags |= {"max-kl": MAX_KL, "cg-damping": CG_DAMPING, "cg-iterations": CG_ITERATIONS}
     else:
         flags |= {"clip-coef": CLIP, "target-kl": None}
-    # no schedules; Gaussians as wide at the start as SB3's, the Beta begins at alpha = beta = 2
+    # no schedules but mPPO's fading perturbation; Gaussians as wide at the start as SB3's, the Beta
+    # begins at alpha = beta = 2
     flags |= {"narrowing": 0.0, "horizon-growth": 1.0}
     flags["log-excess-init" if algorithm == "mppo_beta" else "log-std-init"] = 0.0
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]

@@ -2,9 +2,10 @@
 
 The observation keeps cos and sin of the angle; how fast the pendulum turns must be remembered.
 Both scripts get the same steps, batches and step sizes. Rows of benchmark/masked_pendulum.csv are
-the mean returns of the mean action in 20 episodes, during the run and at its end.
+the mean returns of the mean action in 20 episodes, during the run and at its end; runs that are
+there already are skipped.
 
-    python benchmark/masked_pendulum.py            # half an hour on one core
+    python benchmark/masked_pendulum.py --help
 """
 
 import csv
@@ -27,7 +28,7 @@ COLUMNS = ["algorithm", "seed", "steps", "mean_return"]
 EPISODES = 20
 COMMON = """--env-id masked_pendulum:MaskedPendulum-v1 --num-envs 32 --num-steps 128 --gamma 0.9
 --reward-scale 0.1 --learning-rate 1e-3 --update-epochs 10 --hidden-sizes 64 64 --log-std-init 0
---horizon-growth 1 --eval-every 5"""
+--horizon-growth 1 --narrowing 0 --eval-every 5"""
 OWN = {"ppo": "--minibatch-size 512", "recurrent_ppo": "--num-minibatches 8"}
 
 
@@ -42,7 +43,7 @@ gymnasium.register("MaskedPendulum-v1", entry_point=masked_pendulum, max_episode
 
 @dataclass
 class Args:
-    steps: int = 300_000  # decisions of each run
+    steps: int = 300_000  # decisions of each run, in whole rollouts
     seeds: tuple[int, ...] = (1, 2, 3)  # one run each of either script
 
 
@@ -55,7 +56,8 @@ def train(algorithm: str, seed: int, steps: int) -> list[tuple[int, float]]:
     words += ["--final-trials", "0"]
     with tempfile.TemporaryDirectory() as folder:
         script = HERE.parent / f"{algorithm}_crane.py"
-        environment = {**os.environ, "PYTHONPATH": str(HERE)}
+        paths = [str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
         subprocess.run([sys.executable, script, *words], cwd=folder, env=environment, check=True)
         events = EventAccumulator(str(next(Path(folder).glob("runs/*"))))
         events.Reload()
@@ -64,11 +66,13 @@ def train(algorithm: str, seed: int, steps: int) -> list[tuple[int, float]]:
 
 if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__)
-    rows = []
+    rows = list(csv.reader(open(RESULTS)))[1:] if RESULTS.exists() else []
     for seed in args.seeds:
         for algorithm in OWN:
+            if [algorithm, str(seed)] in [row[:2] for row in rows]:
+                continue
             curve = train(algorithm, seed, args.steps)
-            rows += [[algorithm, seed, step, round(value, 1)] for step, value in curve]
+            rows += [[algorithm, str(seed), step, round(value, 1)] for step, value in curve]
             print(f"{algorithm}, seed {seed}: {curve[-1][1]:.0f} after {curve[-1][0]} decisions")
             with open(RESULTS.with_suffix(".tmp"), "w", newline="") as file:
                 csv.writer(file).writerows([COLUMNS, *rows])

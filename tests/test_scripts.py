@@ -140,6 +140,7 @@ charts/SPS charts/simulation_SPS charts/learning_rate charts/updates charts/epis
 charts/episodic_length charts/success_rate losses/value_loss losses/policy_loss losses/entropy
 losses/explained_variance losses/grad_norm reward/distance reward/grapple reward/lift reward/balance
 termination/joint_limit time/rollout time/update eval/success_rate eval/success_rate_0.3m
+charts/gamma
 """.split()
 CLIPPED = ["losses/old_approx_kl", "losses/approx_kl", "losses/clipfrac"]
 OWN_KEYS = {
@@ -270,9 +271,10 @@ def test_clear_errors(tmp_path, algorithm):
         ("--resume other.pt", f"is no checkpoint.pt of {algorithm}"),
         ("--num-envs 0", "must be at least 1"),
         (ONE_SAMPLE[algorithm], "standard deviation"),
+        ("--horizon-growth 0", "--horizon-growth must be at least 1"),
         ("--env-id CartPole-v1", "no flat Box"),
         ("--env-id Pendulum-v77", "Pendulum-v77"),
-    ][: 6 if algorithm == "mppo_beta" else 4]:
+    ][: 7 if algorithm == "mppo_beta" else 5]:
         result = run(algorithm, tmp_path, *arguments.split(), check=False)
         assert result.returncode == 1 and "Traceback" not in result.stderr
         assert message in result.stderr
@@ -290,7 +292,7 @@ def test_help_explains_every_argument(tmp_path, algorithm):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm):
-    """1 for ever, cut every 5 steps: V = 1 / (1 - 0.9) = 10; 4.1 if a cut were an end.
+    """1 for ever, cut every 5 steps: V = 1 / (1 - 0.9) = 10; 4.1 or less if a cut were an end.
 
     It stays 10 while the horizon grows to 30 steps, for the reward falls to 1 / 3.
     """
@@ -298,6 +300,9 @@ def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm):
     arguments += " --hidden-sizes 16 --learning-rate 1e-2 --reward-scale 1 --eval-every 0"
     arguments += " --final-trials 0 --torch-threads 1 --total-timesteps 43200 --max-grad-norm 10"
     run(algorithm, tmp_path, *arguments.split())
+    gamma = scalars(only_run(tmp_path))["charts/gamma"]
+    assert len(gamma) == 150 and gamma[37] == pytest.approx(0.9) and gamma[39] > 0.9001
+    assert gamma[-1] == pytest.approx(1 - 0.1 / 3 ** (1 - 1 / (0.75 * 150)))
     saved = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)
     script = module(algorithm)
     agent = script.Agent(1, np.full(1, -1.0), np.full(1, 1.0), script.Args(**saved["args"]))
@@ -312,21 +317,23 @@ def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm):
 def test_exploration_narrows_along_the_run(tmp_path, algorithm):
     """Where nothing is learned, the width ends at its start and the whole of narrowing."""
     nothing = "--learning-rate 0 --max-kl 1e-12" if algorithm == "trpo" else "--learning-rate 0"
-    arguments = f"--total-timesteps 192 --narrowing 0.6 --eval-every 0 {nothing}"
+    arguments = f"--total-timesteps 256 --narrowing 0.6 --eval-every 0 {nothing}"
     run(algorithm, tmp_path, *small(algorithm), *arguments.split())
     saved = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)
+    values = scalars(only_run(tmp_path))
     if algorithm == "mppo_beta":
         width, expected = saved["weights"]["actor.4.bias"], saved["args"]["log_excess_init"] + 0.6
+        assert (np.diff(values["policy/alpha"]) > 0.1).all()
+        assert values["policy/perturbation"] == pytest.approx([0.1, 0.05, 0, 0])
     else:
         width, expected = saved["weights"]["log_std"], saved["args"]["log_std_init"] - 0.6
+        assert values["policy/std"] == pytest.approx(np.exp([-1.2, -1.35, -1.5, -1.65]), rel=1e-3)
     torch.testing.assert_close(width, torch.full_like(width, expected), rtol=0, atol=1e-4)
 
 
 RECALL = "--env-id recall_env:Recall-v0 --num-envs 16 --num-steps 18 --update-epochs 4 --gamma 1"
-RECALL += (
-    " --hidden-sizes 32 --learning-rate 3e-3 --reward-scale 1 --horizon-growth 1 --eval-every 0"
-)
-RECALL += " --final-trials 50 --torch-threads 1 --total-timesteps 25600"
+RECALL += " --hidden-sizes 32 --learning-rate 3e-3 --reward-scale 1 --horizon-growth 1"
+RECALL += " --eval-every 0 --final-trials 50 --torch-threads 1 --total-timesteps 25600"
 
 
 def recalled(algorithm, cwd, *arguments):
