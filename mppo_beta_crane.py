@@ -511,7 +511,8 @@ if __name__ == "__main__":
                         stats.setdefault(name, []).append(value.item())
                 epoch_kl = np.mean(stats["losses/approx_kl"][-num_minibatches:])
                 # rpo's shift alone would pass the bound
-                bounded = args.target_kl is not None and args.perturb != "rpo"
+                shifted = args.perturb == "rpo" and epsilon > 0
+                bounded = args.target_kl is not None and not shifted
                 if bounded and epoch_kl > args.target_kl:
                     break
             with torch.no_grad():
@@ -525,6 +526,7 @@ if __name__ == "__main__":
                 stats["losses/explained_variance"] = [(1 - residual_var / b_returns.var()).item()]
                 # only now, so that rollout and update have seen the same policy
                 agent.update_normalizer(b_obs)
+                # alpha - 1 and beta - 1 grow alike: narrower about the same mode
                 agent.actor[-1].bias += args.narrowing / num_iterations
             completed = iteration
 

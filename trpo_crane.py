@@ -102,7 +102,7 @@ class Args:
     line_search_decay: float = 0.8  # c, factor on the step from one to the next
     max_grad_norm: float = 0.5  # bound of the norm of the critic's gradient
     log_std_init: float = -1.2  # log sigma at the start [action units]
-    narrowing: float = 1.25  # by which it sinks along the run, whatever is learned; 0: it does not
+    narrowing: float = 0.3  # by which it sinks along the run, whatever is learned; 0: it does not
 
     # --- reports
     eval_every: int = 50  # updates between two deterministic evaluations, 0 for none

@@ -93,6 +93,11 @@ def test_what_the_scripts_share_is_the_same(algorithm):
         inspect.getsource(s).partition("            completed = ")[2] for s in (ours, theirs)
     ]
     assert reports[0] == reports[1] and len(reports[0]) > 1000
+    schedules = [
+        re.search(r" fraction = 1\.0 .*?args.gae_lambda\*\*tenths", inspect.getsource(s), re.S)[0]
+        for s in (ours, theirs)
+    ]
+    assert schedules[0] == schedules[1]
     assert not re.search(r"^\s*(import|from) \w*(ppo|trpo)", text, re.MULTILINE)
 
 
