@@ -256,9 +256,11 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
         ended |= terminated | truncated
     fps = round(1 / (frame_every * envs.dt))
     options = {"duration": 1000 / fps, "loop": 0} if args.video.suffix == ".gif" else {"fps": fps}
-    with imageio.get_writer(args.video, **options) as video:
+    unfinished = args.video.with_name(f"unfinished_{args.video.name}")
+    with imageio.get_writer(unfinished, **options) as video:
         for frame in (frame for trial in frames for frame in trial):
             video.append_data(frame)
+    os.replace(unfinished, args.video)
     envs.close()
     print(f"{len(seeds)} trials filmed in {args.video}")
 
