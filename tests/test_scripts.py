@@ -306,6 +306,7 @@ def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm):
     arguments = "--env-id recall_env:Endless-v0 --num-envs 16 --num-steps 18 --gamma 0.9"
     arguments += " --hidden-sizes 16 --learning-rate 1e-2 --reward-scale 1 --eval-every 0"
     arguments += " --final-trials 0 --torch-threads 1 --total-timesteps 43200 --max-grad-norm 10"
+    arguments += " --no-anneal-lr"
     run(algorithm, tmp_path, *arguments.split())
     gamma = scalars(only_run(tmp_path))["charts/gamma"]
     assert len(gamma) == 150 and gamma[37] == pytest.approx(0.9) and gamma[39] > 0.9001
