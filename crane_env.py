@@ -29,7 +29,7 @@ Observation, float32, `Box` of shape (18,):
 | 13    | q8 velocity                                      | rad/s | -10     | 10     |
 | 14    | Delta_p,x from grapple centre to log, world axes | m     | -20     | 20     |
 | 15    | Delta_p,y                                        | m     | -20     | 20     |
-| 16    | Delta_p,z, with the paper's offset               | m     | -20     | 20     |
+| 16    | Delta_p,z, see offset                            | m     | -20     | 20     |
 | 17    | Delta_psi, 0 aligned (signed_yaw: angle in rad)  | 1     | -1.5708 | 1.5708 |
 
 Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
