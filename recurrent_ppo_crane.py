@@ -345,6 +345,7 @@ if __name__ == "__main__":
     num_iterations = max(1, args.total_timesteps // batch_size)
     # gamma, lambda and the reward scale are stated per 0.1 s
     tenths = args.frame_skip / 20 if is_crane(args) else 1.0
+    gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
     device = torch.device(args.device)
@@ -426,7 +427,6 @@ if __name__ == "__main__":
             # the horizon grows after the first quarter, the reward shrinks alike: V keeps its size
             growth = args.horizon_growth ** max(0.0, 1 - fraction / 0.75)
             gamma = (1 - (1 - args.gamma) / growth) ** tenths
-            gae_lambda = args.gae_lambda**tenths
             reward_scale = args.reward_scale * tenths / growth
             ended: dict[str, list] = {"return": [], "length": [], "termination": []}
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
