@@ -195,27 +195,21 @@ def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array,
     return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
 
-def relative_pose(
-    state: CraneState, offset: str = "plus", signed_yaw: bool = False
-) -> tuple[Array, Array, Array]:
-    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], and what is observed of the angle, (N,).
+def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
+    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in [-pi/2, pi/2) rad.
 
     Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
-    log's diameter d (README, errata), which offset "plus" adds and "minus" subtracts. The last
-    value is Delta_psi, or with signed_yaw the angle from grapple to log, in [-pi/2, pi/2) rad.
+    log's diameter d (README, errata), which offset "plus" adds and "minus" subtracts. The signed
+    angle turns the grapple's axis into the log's, a line without direction.
     """
-    sign = 1.0 if offset == "plus" else -1.0
     delta_p = state.log_centre - state.grapple_centre
-    delta_p[:, 2] += sign * (D_MAX - state.diameter) / 2
-    log_xy = state.log_axis[:, :2]
-    log_xy = log_xy / np.maximum(np.linalg.norm(log_xy, axis=-1, keepdims=True), 1e-9)
-    dot = np.sum(state.grapple_axis[:, :2] * log_xy, axis=-1)
-    delta_psi = 1.0 - np.minimum(np.abs(dot), 1.0)
-    if not signed_yaw:
-        return delta_p, delta_psi, delta_psi
-    cross = state.grapple_axis[:, 0] * log_xy[:, 1] - state.grapple_axis[:, 1] * log_xy[:, 0]
-    angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
-    return delta_p, delta_psi, angle
+    delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
+    axis, log = state.grapple_axis[:, :2], state.log_axis[:, :2]
+    log = log / np.maximum(np.linalg.norm(log, axis=-1, keepdims=True), 1e-9)
+    dot = np.sum(axis * log, axis=-1)
+    cross = axis[:, 0] * log[:, 1] - axis[:, 1] * log[:, 0]
+    signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
+    return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
 
 
 def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
@@ -382,11 +376,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.difficulty = difficulty
         self.fixed_diameter = None
         if diameter is not None:
-            if np.shape(diameter) not in [(), (self.num_envs,)]:
-                raise ValueError(f"diameter must be one number or {self.num_envs} numbers")
-            self.fixed_diameter = np.broadcast_to(np.asarray(diameter, float), self.num_envs)
-            if not np.all((D_MIN <= self.fixed_diameter) & (self.fixed_diameter <= D_MAX)):
-                raise ValueError(f"diameter must lie in [{D_MIN}, {D_MAX}] m, got {diameter}")
+            d = np.asarray(diameter, float)
+            if d.shape not in [(), (self.num_envs,)] or not np.all((D_MIN <= d) & (d <= D_MAX)):
+                needed = f"one number or {self.num_envs} numbers in [{D_MIN}, {D_MAX}] m"
+                raise ValueError(f"diameter must be {needed}, got {diameter}")
+            self.fixed_diameter = np.broadcast_to(d, self.num_envs)
 
         self.model = load_model(**model_options)
         self.batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
@@ -397,9 +391,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._diameter = np.full(self.num_envs, (D_MIN + D_MAX) / 2)
         self._decisions = np.zeros(self.num_envs, int)
         self._reach_time = np.full(self.num_envs, np.inf)
-        self._last_clearance = np.zeros((self.num_envs, window))
-        self._last_miss = np.zeros((self.num_envs, window))
-        self._last_touching = np.zeros((self.num_envs, window, 2), bool)
+        self._window = np.zeros((self.num_envs, window, 4))  # clearance, touching (2), miss
         self._noise = np.zeros((self.num_envs, self.max_decisions + 1, 2))
         self._rngs: list[tuple[Generator, Generator]] | None = None
 
@@ -425,17 +417,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
         self._log_body = model.body("log").id
         self._log_qpos = slice(model.joint("log").qposadr[0], model.joint("log").qposadr[0] + 7)
-        joints = [model.joint(name) for name in JOINTS]
-        servos = [model.joint(name) for name in SERVOS]
-        self._q = np.array([j.qposadr[0] for j in joints])
-        self._dq = np.array([joints[i].dofadr[0] for i in ACTUATED])
-        self._servo_q = np.array([j.qposadr[0] for j in servos])
-        self._servo_dq = np.array([j.dofadr[0] for j in servos])
-        self.joint_range = np.array([j.range for j in joints])  # (8, 2), rad and m
-        integral = [model.actuator(f"{name}_integral") for name in SERVOS]
-        self._servo_kp = np.array([a.gainprm[0] for a in integral])
-        force_limit = model.jnt_actfrcrange[[j.id for j in servos], 1]  # N m, telescopes N
-        self._max_lead = force_limit / self._servo_kp
+        joints = [model.joint(name).id for name in JOINTS]
+        servos = [model.joint(name).id for name in SERVOS]
+        self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
+        self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
+        self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
+        integrals = [model.actuator(f"{name}_integral").id for name in SERVOS]
+        self._servo_kp = model.actuator_gainprm[integrals, 0]
+        self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
 
     def reset(
         self, *, seed: int | Sequence[int | SeedSequence] | None = None, options: dict | None = None
@@ -493,15 +482,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.where(reach, np.minimum(self._reach_time, time), self._reach_time)
         reached = np.isfinite(self._reach_time)
-        now = np.arange(self.num_envs), self._decisions % self._last_miss.shape[1]
-        self._last_clearance[now] = info["clearance"]
-        self._last_miss[now] = info["centre_miss"]
-        self._last_touching[now] = state.touching
+        now = np.column_stack([info["clearance"], state.touching, info["centre_miss"]])
+        slot = self._decisions % self._window.shape[1]
+        self._window[np.arange(self.num_envs), slot] = now
 
         rule = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         truncated = TERMINATIONS[rule] == "time_limit"
-        last = self._last_clearance, self._last_touching, self._last_miss
-        conditions = success_conditions(reached, *last)
+        w = self._window
+        conditions = success_conditions(reached, w[..., 0], w[..., 1:3] > 0, w[..., 3])
         conditions["success"] &= truncated
         info |= conditions | {"termination": TERMINATIONS[rule], "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
@@ -585,7 +573,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def _observe(self, state: CraneState) -> Array:
         """Observations (N, 18), float32, inside the observation space."""
-        delta_p, _, angle = relative_pose(state, self.offset, self.signed_yaw)
+        delta_p, delta_psi, signed_angle = relative_pose(state, self.offset)
+        angle = signed_angle if self.signed_yaw else delta_psi
         if self.pose_noise != "none":
             now = np.minimum(self._decisions, self.max_decisions)
             epsilon = self._noise[np.arange(self.num_envs), now]
@@ -650,7 +639,7 @@ class CraneEnv(gymnasium.Env):
     metadata = CraneVectorEnv.metadata
 
     def __init__(self, **kwargs: Any):
-        self.envs = CraneVectorEnv(num_envs=1, env_threads=1, **kwargs)
+        self.envs = CraneVectorEnv(num_envs=1, **{"env_threads": 1, **kwargs})
         self.metadata = {k: v for k, v in self.envs.metadata.items() if k != "autoreset_mode"}
         self.render_mode = self.envs.render_mode
         self.observation_space = self.envs.single_observation_space

@@ -89,22 +89,30 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        algorithm, args, weights = saved["algorithm"], saved["args"], saved["weights"]
+        algorithm, args = str(saved["algorithm"]), dict(saved["args"])
+        weights = saved["weights"]
     except Exception:
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
     if algorithm not in ALGORITHMS:
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
     module = ALGORITHMS[algorithm]
     known = {field.name for field in fields(module.Args)}
-    args = module.Args(**{key: value for key, value in args.items() if key in known})
-    if not module.is_crane(args):
-        raise SystemExit(f"{path} was trained on {args.env_id}, not on the crane")
+    if args.keys() != known:
+        names = ", ".join(sorted(map(str, args.keys() ^ known)))
+        print(
+            f"{path} is of another revision, which may matter; differs in: {names}", file=sys.stderr
+        )
     try:
+        args = module.Args(**{key: value for key, value in args.items() if key in known})
+        on_crane = module.is_crane(args)
         agent = module.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
-        agent.load_state_dict(weights)
-    except RuntimeError as error:
+        if on_crane:
+            agent.load_state_dict(weights)
+    except Exception as error:
         reason = str(error).splitlines()[-1].strip()
         raise SystemExit(f"{path}: weights do not fit a {algorithm} policy: {reason}") from None
+    if not on_crane:
+        raise SystemExit(f"{path} was trained on {args.env_id}, not on the crane")
 
     def make_act() -> Act:
         state = None
@@ -234,34 +242,26 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     skip = kwargs.pop("frame_skip", 20)
     substeps = 2 if skip % 20 == 0 else 1
     frame_every = max(1, round(10 / (skip // substeps)))
+    fps = round(1 / (frame_every * skip // substeps * crane_env.TIMESTEP))
+    gif = args.video.suffix == ".gif"
+    options = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
+    size = {"width": args.width, "height": args.width * 9 // 32 * 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
-    envs = CraneVectorEnv(
-        len(seeds),
-        skip // substeps,
-        diameter=diameters,
-        width=args.width,
-        height=args.width * 9 // 16,
-        **kwargs,
-    )
-    frames: list[list[np.ndarray]] = [[] for _ in seeds]
-    obs, _ = envs.reset(seed=seeds)
-    act, ended = make_act(), np.zeros(len(seeds), bool)
-    for step in tqdm(range(envs.max_decisions), desc="filming"):
-        if step % substeps == 0:
-            actions = act(obs)
-        obs, _, terminated, truncated, _ = envs.advance(actions)
-        if step % frame_every == 0:
-            for i in np.flatnonzero(~ended):
-                frames[i].append(envs.render_crane(i, args.camera))
-        ended |= terminated | truncated
-    fps = round(1 / (frame_every * envs.dt))
-    options = {"duration": 1000 / fps, "loop": 0} if args.video.suffix == ".gif" else {"fps": fps}
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
     with imageio.get_writer(unfinished, **options) as video:
-        for frame in (frame for trial in frames for frame in trial):
-            video.append_data(frame)
+        for diameter, seed in zip(tqdm(diameters, desc="trials filmed"), seeds):
+            envs = CraneVectorEnv(1, skip // substeps, diameter=diameter, **size, **kwargs)
+            obs, _ = envs.reset(seed=[seed])
+            act, ended, step = make_act(), False, 0
+            while not ended:
+                if step % substeps == 0:
+                    actions = act(obs)
+                obs, _, terminated, truncated, _ = envs.advance(actions)
+                if step % frame_every == 0:
+                    video.append_data(envs.render_crane(0, args.camera))
+                ended, step = terminated[0] or truncated[0], step + 1
+            envs.close()
     os.replace(unfinished, args.video)
-    envs.close()
     print(f"{len(seeds)} trials filmed in {args.video}")
 
 
@@ -286,26 +286,48 @@ def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    if args.trials < 1:
-        raise SystemExit(f"--trials must be at least 1, got {args.trials}")
-    if not args.diameters:
-        raise SystemExit("--diameters needs at least one number")
-    if args.video and args.video.suffix not in (".mp4", ".gif"):
-        raise SystemExit(f"--video: {args.video} must end in .mp4 or .gif")
-    if not 64 <= args.width <= 1920:
-        raise SystemExit(f"--width must lie in [64, 1920], got {args.width}")
     headless = not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    if args.viewer and sys.platform == "linux" and headless:
-        raise SystemExit("--viewer needs a display, and DISPLAY is not set; use --video lift.mp4")
+    low, high = crane_env.D_MIN, crane_env.D_MAX
+    for wrong, message in [
+        (args.trials < 1, f"--trials must be at least 1, got {args.trials}"),
+        (args.seed < 0, f"--seed must be at least 0, got {args.seed}"),
+        (args.env_threads < 0, f"--env-threads must be at least 0, got {args.env_threads}"),
+        (not args.diameters, "--diameters needs at least one number"),
+        (
+            not all(low <= d <= high for d in args.diameters),
+            f"--diameters must lie in [{low}, {high}] m, got {args.diameters}",
+        ),
+        (args.policy != "file" and args.path != SHIPPED, "PATH goes with --policy file only"),
+        (args.policy != "file" and args.stochastic, "--stochastic goes with --policy file only"),
+        (
+            args.policy != "scripted" and not args.signed_yaw,
+            "--no-signed-yaw is for --policy scripted; a trained policy brings its own",
+        ),
+        (args.video and args.viewer, "either --video or --viewer"),
+        (
+            (args.video or args.viewer) and (args.json or args.csv),
+            "--video and --viewer judge nothing, so that --json and --csv have nothing to write",
+        ),
+        (
+            args.video and args.video.suffix not in (".mp4", ".gif"),
+            f"--video: {args.video} must end in .mp4 or .gif",
+        ),
+        (
+            args.width % 2 or not 64 <= args.width <= 1920,
+            f"--width must be even and lie in [64, 1920], got {args.width}",
+        ),
+        (
+            args.viewer and sys.platform == "linux" and headless,
+            "--viewer needs a display, and DISPLAY is not set; use --video lift.mp4",
+        ),
+    ]:
+        if wrong:
+            raise SystemExit(message)
     for path in filter(None, (args.video, args.csv)):
         if not path.parent.is_dir():
             raise SystemExit(f"no folder {path.parent}; make it first")
-    if not all(crane_env.D_MIN <= d <= crane_env.D_MAX for d in args.diameters):
-        raise SystemExit(f"--diameters must lie in [0.3, 0.8] m, got {args.diameters}")
-    if args.policy != "scripted" and not args.signed_yaw:
-        raise SystemExit(
-            "--no-signed-yaw is for --policy scripted; a trained policy brings its own"
-        )
+        if path.is_dir():
+            raise SystemExit(f"{path} is a folder; name a file")
     if args.policy == "file":
         make_act, kwargs, name = load_policy(args.path, args.stochastic)
         source = str(args.path)

@@ -28,22 +28,21 @@ def state(**changes):
 
 def test_relative_pose():
     # offset (0.8 - 0.4) / 2 = 0.2: target heights 0.2 + 0.2 = 0.4 and 0.2 - 0.2 = 0
-    delta_p, delta_psi, observed = crane_env.relative_pose(state())
+    delta_p, delta_psi, _ = crane_env.relative_pose(state())
     np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.1]])
     np.testing.assert_allclose(delta_psi, [0.2])  # 1 - |0.6 * 0 + 0.8 * 1|
-    np.testing.assert_allclose(observed, [0.2])
     delta_p, _, _ = crane_env.relative_pose(state(), offset="minus")
     np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.5]])
 
 
 def test_angle_is_that_of_a_line_not_of_an_arrow():
     for axis in ([0.0, 1.0, 0.0], [0.0, -1.0, 0.0]):
-        _, delta_psi, signed = crane_env.relative_pose(state(log_axis=axis), signed_yaw=True)
+        _, delta_psi, signed = crane_env.relative_pose(state(log_axis=axis))
         np.testing.assert_allclose(delta_psi, [0.2])
         # the grapple points atan2(0.8, 0.6) = 53.13 degrees, the log 90: 36.87 degrees to the left
         np.testing.assert_allclose(signed, [np.radians(36.8698976)])
     right = np.array([np.cos(0.1), np.sin(0.1), 0.0])
-    _, _, signed = crane_env.relative_pose(state(log_axis=right), signed_yaw=True)
+    _, _, signed = crane_env.relative_pose(state(log_axis=right))
     np.testing.assert_allclose(signed, [0.1 - np.arctan2(0.8, 0.6)])
 
 
@@ -184,7 +183,7 @@ def test_success_needs_the_whole_episode():
     """The window holds the last 0.5 s, and success comes with the time limit only."""
     for frame_skip, window in [(20, 6), (1, 101), (4, 26)]:
         envs = CraneVectorEnv(1, frame_skip=frame_skip)
-        assert envs._last_miss.shape[1] == window
+        assert envs._window.shape[1] == window
         assert envs.max_decisions * frame_skip == 1800
     envs = CraneVectorEnv(1)
     envs.reset(seed=0)
