@@ -30,7 +30,7 @@ Observation, float32, `Box` of shape (18,):
 | 14    | Delta_p,x from grapple centre to log, world axes | m     | -20     | 20     |
 | 15    | Delta_p,y                                        | m     | -20     | 20     |
 | 16    | Delta_p,z, see offset                            | m     | -20     | 20     |
-| 17    | Delta_psi, 0 aligned (signed_yaw: angle in rad)  | 1     | -1.5708 | 1.5708 |
+| 17    | Delta_psi, 0 aligned (signed_yaw: angle in rad)  | 1     | -4.7124 | 4.7124 |
 
 Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
 direction. 0 stops the joint; values outside the box are clipped.
@@ -77,6 +77,7 @@ TIME_LIMIT = 9.0  # s
 REACH_TIME = 6.0  # s
 REACH_DISTANCE = 0.35  # m, bound of d_combine
 LOG_RANGE = 8.0  # m, between grapple centre and log centre
+Q7_MAX = 2.8  # rad, where the rotator may be sent
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
@@ -196,11 +197,12 @@ def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array,
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
-    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in [-pi/2, pi/2) rad.
+    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
 
     Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
     log's diameter d (README, errata), which offset "plus" adds and "minus" subtracts. The signed
-    angle turns the grapple's axis into the log's, a line without direction.
+    angle turns the grapple's axis into the log's, a line without direction: the shorter turn, or
+    the other one where the shorter would end within 0.34 rad of the rotator's end stop or beyond.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
@@ -209,6 +211,9 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     dot = np.sum(axis * log, axis=-1)
     cross = axis[:, 0] * log[:, 1] - axis[:, 1] * log[:, 0]
     signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
+    slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
+    rotator = state.q[:, 6] + slew - signed_angle  # once the crane faces the log
+    signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > Q7_MAX)
     return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
 
 
@@ -396,7 +401,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._rngs: list[tuple[Generator, Generator]] | None = None
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
-        bound = np.concatenate([np.full(6, 10.0), np.full(3, 20.0), [np.pi / 2]])
+        bound = np.concatenate([np.full(6, 10.0), np.full(3, 20.0), [1.5 * np.pi]])
         bounds = np.float32([[*low, *-bound], [*high, *bound]])
         self.single_observation_space = gymnasium.spaces.Box(*bounds)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)

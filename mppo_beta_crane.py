@@ -109,6 +109,12 @@ class Args:
     eval_seed: int = 10_000  # seed of all evaluation trials
 
 
+# the smallest values that mean something
+LEAST = dict(total_timesteps=1, num_envs=1, num_steps=1, hidden_sizes=1, learning_rate=0)
+LEAST |= dict(minibatch_size=1, update_epochs=1, perturbation=0, log_excess_max=0.1)
+LEAST |= dict(frame_skip=1, torch_threads=1, env_threads=0, seed=0, eval_seed=0, eval_every=0)
+LEAST |= dict(eval_trials=1, final_trials=0, horizon_growth=1, max_grad_norm=0)
+
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
 PAPER = Args(
     paper=True,
@@ -174,7 +180,7 @@ class Agent(nn.Module):
         return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
 
     def update_normalizer(self, obs: torch.Tensor) -> None:
-        """Merge the mean and variance of obs (B, obs_dim) into the running ones (Chan et al.)."""
+        """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
         obs = obs.double()
         count = self.obs_count + len(obs)
         delta = obs.mean(0) - self.obs_mean
@@ -184,23 +190,24 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+        """obs in running standard deviations, as all but `predict` take them."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
     def get_value(self, obs: torch.Tensor) -> torch.Tensor:
         """V(s), (B,)."""
-        return self.critic(self.normalize(obs)).squeeze(-1)
+        return self.critic(obs).squeeze(-1)
 
     def get_distribution(self, obs: torch.Tensor) -> Beta:
         """Beta over a_n in [0, 1], batch shape (B, act_dim), alpha and beta above 1."""
         bound = self.log_excess_max
-        log_excess = bound * torch.tanh(self.actor(self.normalize(obs)) / bound)
+        log_excess = bound * torch.tanh(self.actor(obs) / bound)
         alpha, beta = (1 + log_excess.exp()).chunk(2, dim=-1)
         return Beta(alpha, beta, validate_args=False)
 
     def predict(self, obs: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
         """Actions (B, act_dim) in the environment's units, without perturbation."""
-        distribution = self.get_distribution(obs)
+        distribution = self.get_distribution(self.normalize(obs))
         return self.to_env(distribution.mean if deterministic else distribution.sample())
 
     def to_env(self, actions: torch.Tensor) -> torch.Tensor:
@@ -314,21 +321,23 @@ if __name__ == "__main__":
             raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
             checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
-            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
-            args = Args(**{**checkpoint["args"], **machine})
+            saved = dict(checkpoint["args"])
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
-            ours &= checkpoint["args"].keys() == asdict(args).keys()  # those of this revision
         except Exception:
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
+        if saved.keys() != asdict(args).keys():
+            raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
+        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
-    if min(args.num_envs, args.num_steps, args.minibatch_size) < 1:
-        raise SystemExit("--num-envs, --num-steps and --minibatch-size must be at least 1")
-    if args.horizon_growth < 1:
-        raise SystemExit("--horizon-growth must be at least 1, which keeps gamma as it is")
+    for name, least in LEAST.items():
+        if np.min(getattr(args, name), initial=least) < least:
+            raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
+    if not (0 <= args.gamma < 1 and 0 <= args.gae_lambda <= 1):
+        raise SystemExit("--gamma must lie in [0, 1) and --gae-lambda in [0, 1]")
     batch_size = args.num_envs * args.num_steps
     num_minibatches = -(-batch_size // args.minibatch_size)
     num_iterations = max(1, args.total_timesteps // batch_size)
@@ -345,7 +354,7 @@ if __name__ == "__main__":
 
     try:
         envs = make_envs(args, args.num_envs)
-    except (gymnasium.error.Error, ValueError) as error:
+    except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     spaces = (obs_space, action_space)
@@ -425,9 +434,11 @@ if __name__ == "__main__":
             terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
             cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
             for step in range(args.num_steps):
-                obs[step] = next_obs
                 with torch.no_grad():
-                    action = agent.get_distribution(next_obs).sample()
+                    agent.update_normalizer(next_obs)
+                    # kept as the policy saw it, for the normaliser moves on
+                    obs[step] = agent.normalize(next_obs)
+                    action = agent.get_distribution(obs[step]).sample()
                     noise = epsilon if args.perturb == "action" else 0.0
                     actions[step] = perturb_actions(action, noise)
                     env_actions = agent.to_env(actions[step]).cpu().numpy()
@@ -463,9 +474,10 @@ if __name__ == "__main__":
                 b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
                 values = agent.get_value(b_obs).view_as(rewards)
                 b_logprobs = agent.get_distribution(b_obs).log_prob(b_actions).sum(-1)
-                last_value, cut_values = agent.get_value(next_obs), None
+                last_value, cut_values = agent.get_value(agent.normalize(next_obs)), None
                 if cut_at:
-                    cut_values = agent.get_value(torch.as_tensor(np.stack(cut_obs), device=device))
+                    last_obs = torch.as_tensor(np.stack(cut_obs), device=device)
+                    cut_values = agent.get_value(agent.normalize(last_obs))
                 next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
                 advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
                 returns = advantages + values
@@ -524,8 +536,6 @@ if __name__ == "__main__":
                 stats["policy/boundary_frac"] = [boundary.float().mean().item()]
                 residual_var = (b_returns - values.flatten()).var()
                 stats["losses/explained_variance"] = [(1 - residual_var / b_returns.var()).item()]
-                # only now, so that rollout and update have seen the same policy
-                agent.update_normalizer(b_obs)
                 # alpha - 1 and beta - 1 grow alike: narrower about the same mode
                 agent.actor[-1].bias += args.narrowing / num_iterations
             completed = iteration

@@ -107,6 +107,12 @@ class Args:
     eval_seed: int = 10_000  # seed of all evaluation trials
 
 
+# the smallest values that mean something
+LEAST = dict(total_timesteps=1, num_envs=1, num_steps=1, hidden_sizes=1, learning_rate=0)
+LEAST |= dict(num_minibatches=1, update_epochs=1, lstm_size=1)
+LEAST |= dict(frame_skip=1, torch_threads=1, env_threads=0, seed=0, eval_seed=0, eval_every=0)
+LEAST |= dict(eval_trials=1, final_trials=0, horizon_growth=1, max_grad_norm=0)
+
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
 PAPER = Args(
     paper=True,
@@ -170,7 +176,7 @@ class Agent(nn.Module):
         return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
 
     def update_normalizer(self, obs: torch.Tensor) -> None:
-        """Merge the mean and variance of obs (B, obs_dim) into the running ones (Chan et al.)."""
+        """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
         obs = obs.double()
         count = self.obs_count + len(obs)
         delta = obs.mean(0) - self.obs_mean
@@ -180,6 +186,7 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+        """obs in running standard deviations, as all but `predict` take them."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
@@ -195,14 +202,13 @@ class Agent(nn.Module):
         state: h and c, (N, lstm_size), before obs[0]. starts (T, N) is 1 where obs begins an
         episode, whose memory is empty.
         """
-        scaled = self.normalize(obs)
         h, c = state
         memories = []
-        for x, start in zip(scaled, starts):
+        for x, start in zip(obs, starts):
             keep = (1 - start)[:, None]
             h, c = self.lstm(x, (keep * h, keep * c))
             memories.append(h)
-        return torch.cat([scaled, torch.stack(memories)], dim=-1), (h, c)
+        return torch.cat([obs, torch.stack(memories)], dim=-1), (h, c)
 
     def get_value(self, features: torch.Tensor) -> torch.Tensor:
         """V of features (..., obs_dim + lstm_size)."""
@@ -217,7 +223,8 @@ class Agent(nn.Module):
         self, obs: torch.Tensor, state: State, deterministic: bool = True
     ) -> tuple[torch.Tensor, State]:
         """Actions (N, act_dim) in the environment's units, and the state that follows."""
-        features, state = self.remember(obs[None], state, torch.zeros(1, len(obs)).to(obs))
+        x, starts = self.normalize(obs)[None], torch.zeros(1, len(obs)).to(obs)
+        features, state = self.remember(x, state, starts)
         distribution = self.get_distribution(features[0])
         actions = distribution.mean if deterministic else distribution.sample()
         return self.to_env(actions), state
@@ -320,25 +327,27 @@ if __name__ == "__main__":
             raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
             checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
-            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
-            args = Args(**{**checkpoint["args"], **machine})
+            saved = dict(checkpoint["args"])
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
-            ours &= checkpoint["args"].keys() == asdict(args).keys()  # those of this revision
         except Exception:
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
+        if saved.keys() != asdict(args).keys():
+            raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
+        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
-    if min(args.num_envs, args.num_steps, args.num_minibatches) < 1:
-        raise SystemExit("--num-envs, --num-steps and --num-minibatches must be at least 1")
+    for name, least in LEAST.items():
+        if np.min(getattr(args, name), initial=least) < least:
+            raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
+    if not (0 <= args.gamma < 1 and 0 <= args.gae_lambda <= 1):
+        raise SystemExit("--gamma must lie in [0, 1) and --gae-lambda in [0, 1]")
     if args.num_envs % args.num_minibatches:
         raise SystemExit(
             "--num-envs must be a multiple of --num-minibatches: cranes are shared out"
         )
-    if args.horizon_growth < 1:
-        raise SystemExit("--horizon-growth must be at least 1, which keeps gamma as it is")
     batch_size = args.num_envs * args.num_steps
     if batch_size // args.num_minibatches < 2:
         raise SystemExit("--num-minibatches leaves one sample alone, with no standard deviation")
@@ -354,7 +363,7 @@ if __name__ == "__main__":
 
     try:
         envs = make_envs(args, args.num_envs)
-    except (gymnasium.error.Error, ValueError) as error:
+    except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     spaces = (obs_space, action_space)
@@ -434,9 +443,11 @@ if __name__ == "__main__":
             cut_states = []  # what was remembered of them
             first_state = state
             for step in range(args.num_steps):
-                obs[step], starts[step] = next_obs, next_start
                 with torch.no_grad():
-                    features, state = agent.remember(next_obs[None], state, next_start[None])
+                    agent.update_normalizer(next_obs)
+                    # kept as the policy saw it, for the normaliser moves on
+                    obs[step], starts[step] = agent.normalize(next_obs), next_start
+                    features, state = agent.remember(obs[step][None], state, next_start[None])
                     actions[step] = agent.get_distribution(features[0]).sample()
                     env_actions = agent.to_env(actions[step]).cpu().numpy()
                 next_obs, reward, terminated, truncated, info = envs.step(env_actions)
@@ -473,14 +484,14 @@ if __name__ == "__main__":
                 values = agent.get_value(features)
                 logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
                 # looks ahead of the live state, which goes on from where it is
-                features, _ = agent.remember(next_obs[None], state, next_start[None])
+                scaled = agent.normalize(next_obs)[None]
+                features, _ = agent.remember(scaled, state, next_start[None])
                 last_value, cut_values = agent.get_value(features[0]), None
                 if cut_at:
-                    last_obs = torch.as_tensor(np.stack(cut_obs), device=device)[None]
+                    last_obs = torch.as_tensor(np.stack(cut_obs), device=device)
+                    scaled = agent.normalize(last_obs)[None]
                     h, c = torch.stack(cut_states, dim=1)
-                    features, _ = agent.remember(
-                        last_obs, (h, c), torch.zeros_like(last_obs[..., 0])
-                    )
+                    features, _ = agent.remember(scaled, (h, c), torch.zeros_like(scaled[..., 0]))
                     cut_values = agent.get_value(features[0])
                 next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
                 advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
@@ -530,8 +541,6 @@ if __name__ == "__main__":
                 stats["policy/std"] = [agent.log_std.exp().mean().item()]
                 residual_var = (returns - values).var()
                 stats["losses/explained_variance"] = [(1 - residual_var / returns.var()).item()]
-                # only now, so that rollout and update have seen the same policy
-                agent.update_normalizer(obs.flatten(0, 1))
                 agent.log_std -= args.narrowing / num_iterations
             completed = iteration
 

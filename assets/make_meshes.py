@@ -11,6 +11,7 @@ prints the capsule chain of crane.xml, whose straight segments straddle the arc.
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 CHORD = 0.8566  # m, pivot to tip
 SAGITTA = 0.30  # m
@@ -62,7 +63,7 @@ def write_jaw(path: Path, bands: list[tuple[float, float]]) -> None:
     path.write_text("\n".join(["# written by make_meshes.py", *vertices, *faces]) + "\n")
 
 
-if __name__ == "__main__":
+def main() -> None:
     here = Path(__file__).parent
     write_jaw(here / "jaw_outer.obj", OUTER_BANDS)
     write_jaw(here / "jaw_inner.obj", INNER_BANDS)
@@ -74,3 +75,7 @@ if __name__ == "__main__":
     print(f"arc radius {RADIUS:.4f} m, capsules miss it by {500 * chord_sagitta:.1f} mm at most")
     for (x0, y0), (x1, y1) in zip(nodes[:-1], nodes[1:]):
         print(f"fromto: {x0:.4f} {y0:.4f} z  {x1:.4f} {y1:.4f} z")
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

@@ -16,6 +16,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import gymnasium
 import numpy as np
@@ -32,7 +33,7 @@ EPISODES, EVAL_SEED = 20, 10_000
 class Task:
     """Hyperparameters of rl-baselines3-zoo (Pendulum) and CleanRL's ppo_continuous_action."""
 
-    steps: int
+    steps: int  # whole rollouts
     num_envs: int
     num_steps: int
     minibatch_size: int
@@ -42,10 +43,9 @@ class Task:
 
 
 TASKS = {
-    "Pendulum-v1": Task(100_000, 4, 1024, 64, 0.9, 1e-3, 0.1),
-    "HalfCheetah-v5": Task(300_000, 1, 2048, 64, 0.99, 3e-4, 0.1),
+    "Pendulum-v1": Task(102_400, 4, 1024, 64, 0.9, 1e-3, 0.1),
+    "HalfCheetah-v5": Task(299_008, 1, 2048, 64, 0.99, 3e-4, 0.1),
 }
-ALGORITHMS = ("ppo", "mppo_beta", "trpo")
 HIDDEN = (64, 64)
 EPOCHS, GAE_LAMBDA, CLIP = 10, 0.95, 0.2
 MAX_KL, CG_DAMPING, CG_ITERATIONS, CRITIC_LEARNING_RATE = 0.01, 0.1, 15, 1e-3  # TRPO
@@ -53,9 +53,12 @@ MAX_KL, CG_DAMPING, CG_ITERATIONS, CRITIC_LEARNING_RATE = 0.01, 0.1, 15, 1e-3  #
 
 @dataclass
 class Args:
-    tasks: tuple[str, ...] = tuple(TASKS)  # of Pendulum-v1, HalfCheetah-v5
-    algorithms: tuple[str, ...] = ALGORITHMS  # ours; SB3 has no Beta policy: its PPO stands there
-    seeds: tuple[int, ...] = (1, 2, 3)  # one run each
+    tasks: tuple[Literal["Pendulum-v1", "HalfCheetah-v5"], ...] = ("Pendulum-v1", "HalfCheetah-v5")
+    """Gymnasium tasks"""
+    algorithms: tuple[Literal["ppo", "mppo_beta", "trpo"], ...] = ("ppo", "mppo_beta", "trpo")
+    """ours; SB3 has no Beta policy: its PPO stands there"""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """one run each"""
 
 
 def judge(task: str, act) -> tuple[float, float]:
@@ -100,9 +103,8 @@ def train_ours(task: str, algorithm: str, seed: int):
     words += ["--no-anneal-lr", "--hidden-sizes", *map(str, HIDDEN)]
     with tempfile.TemporaryDirectory() as folder:
         script = str(ROOT / f"{algorithm}_crane.py")
-        subprocess.run(
-            [sys.executable, script, *words], cwd=folder, check=True, capture_output=True
-        )
+        command = [sys.executable, script, *words]
+        subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
         (path,) = Path(folder).glob("runs/*/policy.pt")
         sys.path.insert(0, str(ROOT))
         import eval_crane

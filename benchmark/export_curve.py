@@ -4,10 +4,11 @@ python benchmark/export_curve.py runs/<run> benchmark/curves/<name>.csv
 """
 
 import csv
-import sys
 from pathlib import Path
 
+import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tyro.conf import Positional
 
 COLUMNS = {
     "charts/updates": "updates",
@@ -22,7 +23,7 @@ COLUMNS = {
 }
 
 
-def export(run_dir: Path, csv_path: Path) -> None:
+def export(run_dir: Positional[Path], csv_path: Positional[Path]) -> None:
     """Rows by decision count; wall_time_s counts from the end of the first update."""
     events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
     events.Reload()
@@ -46,6 +47,4 @@ def export(run_dir: Path, csv_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        raise SystemExit(__doc__)
-    export(Path(sys.argv[1]), Path(sys.argv[2]))
+    tyro.cli(export, description=__doc__)

@@ -3,7 +3,7 @@
 The observation keeps cos and sin of the angle; how fast the pendulum turns must be remembered.
 Both scripts get the same steps, batches and step sizes. Rows of benchmark/masked_pendulum.csv are
 the mean returns of the mean action in 20 episodes, during the run and at its end; runs that are
-there already are skipped.
+there already and long enough are skipped.
 
     python benchmark/masked_pendulum.py --help
 """
@@ -26,6 +26,7 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "masked_pendulum.csv"
 COLUMNS = ["algorithm", "seed", "steps", "mean_return"]
 EPISODES = 20
+BATCH = 32 * 128  # decisions of a rollout
 COMMON = """--env-id masked_pendulum:MaskedPendulum-v1 --num-envs 32 --num-steps 128 --gamma 0.9
 --reward-scale 0.1 --learning-rate 1e-3 --update-epochs 10 --hidden-sizes 64 64 --log-std-init 0
 --horizon-growth 1 --narrowing 0 --eval-every 5"""
@@ -69,9 +70,11 @@ if __name__ == "__main__":
     rows = list(csv.reader(open(RESULTS)))[1:] if RESULTS.exists() else []
     for seed in args.seeds:
         for algorithm in OWN:
-            if [algorithm, str(seed)] in [row[:2] for row in rows]:
+            old = [row for row in rows if row[:2] == [algorithm, str(seed)]]
+            if max((int(row[2]) for row in old), default=0) > args.steps - BATCH:
                 continue
             curve = train(algorithm, seed, args.steps)
+            rows = [row for row in rows if row not in old]
             rows += [[algorithm, str(seed), step, round(value, 1)] for step, value in curve]
             print(f"{algorithm}, seed {seed}: {curve[-1][1]:.0f} after {curve[-1][0]} decisions")
             with open(RESULTS.with_suffix(".tmp"), "w", newline="") as file:

@@ -10,6 +10,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+import tyro  # noqa: E402
 
 HERE = Path(__file__).parent
 
@@ -20,7 +21,7 @@ def column(rows: list[dict], x: str, y: str, scale: float) -> tuple[list[float],
     return [float(row[x]) * scale for row in rows], [100 * float(row[y]) for row in rows]
 
 
-if __name__ == "__main__":
+def main() -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
     scripts: list[str] = []  # one colour each, whatever the seed
     for path in sorted((HERE / "curves").glob("*_seed*.csv")):
@@ -45,3 +46,7 @@ if __name__ == "__main__":
         axis.set_ylim(0, 100)
     figure.tight_layout()
     figure.savefig(HERE.parent / "assets" / "figures" / "learning_curves.png", dpi=130)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

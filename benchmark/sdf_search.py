@@ -16,6 +16,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+import tyro  # noqa: E402
+from tyro.conf import Positional  # noqa: E402
 
 import eval_crane  # noqa: E402
 from crane_env import monte_carlo_trials  # noqa: E402
@@ -23,9 +25,10 @@ from crane_env import monte_carlo_trials  # noqa: E402
 SETTINGS = [(40, 10), (20, 10), (10, 10), (8, 5), (4, 5), (4, 3), (2, 3)]
 SEED, TRIALS = 30_000, 20  # trials per diameter
 
-if __name__ == "__main__":
+
+def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
+    """path: policy.pt of a run."""
     torch.set_num_threads(1)
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else eval_crane.SHIPPED
     make_act, kwargs, _ = eval_crane.load_policy(path, stochastic=False)
     diameters, seeds = monte_carlo_trials(SEED, TRIALS)
     rows, reference = [], None
@@ -53,3 +56,7 @@ if __name__ == "__main__":
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

@@ -46,6 +46,18 @@ def test_angle_is_that_of_a_line_not_of_an_arrow():
     np.testing.assert_allclose(signed, [0.1 - np.arctan2(0.8, 0.6)])
 
 
+def test_angle_keeps_the_rotator_off_its_end_stop():
+    """Facing the log (slew as its azimuth), a rotator at 2.6 rad that is 0.5 rad off turns back."""
+    log = dict(log_centre=[0.0, -6.0, 0.2], log_axis=[np.cos(-0.5), np.sin(-0.5), 0.0])
+    grapple = dict(grapple_centre=[0.0, -6.0, 1.5], grapple_axis=[1.0, 0.0, 0.0])
+    for q7, expected in [(2.0, -0.5), (2.6, np.pi - 0.5), (-2.6, -0.5)]:
+        q = np.array([-np.pi / 2, 0.5, 0.2, 0.5, 0.87, np.pi / 2, q7, 1.5])
+        _, _, signed = crane_env.relative_pose(state(q=q, **log, **grapple))
+        # turning the grapple by the angle turns the rotator, which hangs head down, by as much back
+        np.testing.assert_allclose(signed, [expected])
+        assert abs(q7 - signed[0]) < 2.8
+
+
 def test_yaw_of_a_tilted_log_is_that_of_its_shadow():
     tilted = np.array([0.0, 0.8, 0.6])
     _, delta_psi, _ = crane_env.relative_pose(state(log_axis=tilted))

@@ -272,16 +272,23 @@ ONE_SAMPLE = {
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_clear_errors(tmp_path, algorithm):
-    torch.save({"algorithm": "other"}, tmp_path / "other.pt")
+    torch.save({"algorithm": "other", "args": {}, "optimizer": {}}, tmp_path / "other.pt")
+    old = {"algorithm": algorithm, "args": {"seed": 1}, "optimizer": {}}
+    torch.save(old, tmp_path / "old.pt")
     for arguments, message in [
         ("--resume nowhere.pt", "--resume: no file nowhere.pt"),
         ("--resume other.pt", f"is no checkpoint.pt of {algorithm}"),
-        ("--num-envs 0", "must be at least 1"),
+        ("--resume old.pt", "old.pt is of another revision"),
+        ("--num-envs 0", "--num-envs must be at least 1"),
         (ONE_SAMPLE[algorithm], "standard deviation"),
+        ("--seed -1", "--seed must be at least 0"),
+        ("--hidden-sizes 8 0", "--hidden-sizes must be at least 1"),
+        ("--gamma 1", "--gamma must lie in [0, 1)"),
+        ("--env-id nowhere:X-v0", "nowhere"),
         ("--horizon-growth 0", "--horizon-growth must be at least 1"),
         ("--env-id CartPole-v1", "no flat Box"),
         ("--env-id Pendulum-v77", "Pendulum-v77"),
-    ][: 7 if algorithm == "mppo_beta" else 5]:
+    ][: 12 if algorithm == "mppo_beta" else 5]:
         result = run(algorithm, tmp_path, *arguments.split(), check=False)
         assert result.returncode == 1 and "Traceback" not in result.stderr
         assert message in result.stderr
