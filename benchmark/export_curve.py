@@ -16,6 +16,8 @@ COLUMNS = {
     "charts/episodic_length": "episodic_length",
     "charts/success_rate": "training_success_rate",
     "charts/SPS": "decisions_per_second",
+    "time/rollout": "rollout_s",
+    "time/update": "update_s",
     "losses/approx_kl": "approx_kl",
     "eval/success_rate": "eval_success_rate",
     "eval/episodic_return": "eval_episodic_return",
