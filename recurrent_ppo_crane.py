@@ -22,7 +22,7 @@ in joint speeds shakes the hanging grapple. The horizon 1 / (1 - gamma) grows, f
 learns to lift and a long one takes time over its grip. The step size falls to 0.
 
     python recurrent_ppo_crane.py                      # the forestry crane, on two cores
-    python recurrent_ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --gamma 0.99 --horizon-growth 1
+    python recurrent_ppo_crane.py --env-id Pendulum-v1 --gamma 0.9 --horizon-growth 1
     python recurrent_ppo_crane.py --resume runs/<run>/checkpoint.pt
 """
 

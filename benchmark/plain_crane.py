@@ -1,0 +1,163 @@
+"""One crane in plain MuJoCo calls: what throughput.py gives to Gymnasium and Stable-Baselines3."""
+
+import sys
+from collections.abc import Callable
+from math import atan2, copysign, exp, hypot, pi, sqrt, tanh
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+import crane_env
+
+
+class PlainCrane(gymnasium.Env):
+    """One crane with plain MuJoCo calls: scalars, views and addresses looked up once.
+
+    The task of CraneVectorEnv(signed_yaw=True). Two things it is spared: info, and the clip of the
+    observation to its space, which an episode that goes on does not reach.
+    """
+
+    def __init__(self, frame_skip: int = 20):
+        self.model = model = crane_env.load_model()
+        self.data = data = mujoco.MjData(model)
+        self.frame_skip, self.dt = frame_skip, frame_skip * crane_env.TIMESTEP
+        self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
+        self.sensordata, self.warnings = data.sensordata, data.warning
+        joints = [model.joint(name).id for name in crane_env.JOINTS]
+        servos = [model.joint(name).id for name in crane_env.SERVOS]
+        self.q_at = model.jnt_qposadr[joints].tolist()
+        self.dq_at = model.jnt_dofadr[joints][crane_env.ACTUATED].tolist()
+        self.servo_q, self.servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
+        integrals = [model.actuator(f"{name}_integral").id for name in crane_env.SERVOS]
+        self.kp = model.actuator_gainprm[integrals, 0]
+        lead = model.jnt_actfrcrange[servos, 1] / self.kp
+        self.servos = list(zip(self.servo_q.tolist(), lead.tolist()))
+        self.limits = model.jnt_range[joints][crane_env.LIMITED].tolist()
+        self.speeds = crane_env.SPEEDS["real"].T.tolist()  # lowest and highest of each joint
+        self.log_q = model.joint("log").qposadr[0]
+        self.log_body = model.body("log").id
+        self.log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
+        low, high = model.jnt_range[joints].T + [[-0.5], [0.5]]
+        bound = [10.0] * 6 + [20.0] * 3 + [1.5 * pi]
+        low, high = np.float32([*low, *np.negative(bound)]), np.float32([*high, *bound])
+        self.observation_space = gymnasium.spaces.Box(low, high)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+        super().reset(seed=seed)
+        model, data = self.model, self.data
+        q, (x, y, yaw), diameter = crane_env.sample_start(self.np_random)
+        radius, length = diameter / 2, crane_env.LOG_LENGTH
+        mass = crane_env.LOG_DENSITY * pi * radius**2 * length
+        across = mass * (3 * radius**2 + length**2) / 12
+        cylinder, capsule = self.log_geoms
+        model.geom_size[[cylinder, capsule], 0] = radius
+        model.geom_size[capsule, 1] = length / 2 - radius
+        model.body_mass[self.log_body] = mass
+        model.body_inertia[self.log_body] = across, across, mass * radius**2 / 2
+        mujoco.mj_setConst(model, data)
+        mujoco.mj_resetData(model, data)
+        cos, sin = np.cos(yaw / 2) / sqrt(2), np.sin(yaw / 2) / sqrt(2)
+        self.qpos[self.log_q : self.log_q + 7] = x, y, radius, cos, -cos, -sin, sin
+        self.qpos[self.q_at] = q
+        self.qpos[self.servo_q] = q[crane_env.ACTUATED][crane_env.COMMAND_OF_SERVO]
+        mujoco.mj_step1(model, data)
+        self.act[:] = self.qpos[self.servo_q] + data.qfrc_bias[self.servo_dq] / self.kp
+        self.diameter, self.decisions, self.reached = float(diameter), 0, False
+        return self._observe([0.0] * 6)[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        model, data = self.model, self.data
+        command = []
+        for a, (low, high) in zip(action.tolist(), self.speeds):
+            a = min(max(a, -1.0), 1.0)
+            command.append(a * high if a >= 0 else -a * low)
+        self.ctrl[:] = 2 * [command[i] for i in crane_env.COMMAND_OF_SERVO]
+        for start in range(0, self.frame_skip, crane_env.ANTI_WINDUP):
+            qpos = self.qpos.tolist()
+            self.act[:] = [
+                min(max(a, qpos[i] - lead), qpos[i] + lead)
+                for a, (i, lead) in zip(self.act.tolist(), self.servos)
+            ]
+            nstep = min(crane_env.ANTI_WINDUP, self.frame_skip - start)
+            if start == 0:
+                mujoco.mj_step2(model, data)  # mj_step1 has been called, for the observation
+                nstep -= 1
+            if nstep > 0:
+                mujoco.mj_step(model, data, nstep)
+        mujoco.mj_step1(model, data)
+        self.decisions += 1
+        now = self.decisions * self.dt
+
+        obs, reward, d_combine, distance, q, dq = self._observe(command)
+        if d_combine < crane_env.REACH_DISTANCE and now < crane_env.REACH_TIME + 1e-9:
+            self.reached = True
+        diverged = bool(self.warnings.number.any())
+        terminated = (
+            diverged
+            or not all(low <= x <= high for x, (low, high) in zip(q, self.limits))
+            or not all(2 * low <= v <= 2 * high for v, (low, high) in zip(dq, self.speeds))
+            or distance > crane_env.LOG_RANGE
+            or (not self.reached and now > crane_env.REACH_TIME - 1e-9)
+        )
+        truncated = not terminated and now > crane_env.TIME_LIMIT - 1e-9
+        return obs, 0.0 if diverged else reward, terminated, truncated, {}
+
+    def _observe(self, command: list[float]) -> tuple:
+        """Observation and staged reward, and what the termination rules need."""
+        qpos, qvel = self.qpos.tolist(), self.qvel.tolist()
+        q, dq = [qpos[i] for i in self.q_at], [qvel[i] for i in self.dq_at]
+        (gx, gy, gz, ax, ay, _, lx, ly, lz, ux, uy, uz, *touch) = self.sensordata.tolist()
+        x, y, z = lx - gx, ly - gy, lz - gz
+        distance = sqrt(x * x + y * y + z * z)
+        miss = x * ux + y * uy + z * uz
+        level = max(hypot(ux, uy), 1e-9)
+        dot, cross = (ax * ux + ay * uy) / level, (ax * uy - ay * ux) / level
+        angle = (atan2(cross, dot) + pi / 2) % pi - pi / 2
+        rotator = q[6] + atan2(ly, lx) - q[0] - angle
+        if abs(rotator) > crane_env.Q7_MAX:
+            angle += copysign(pi, rotator)
+        z += (crane_env.D_MAX - self.diameter) / 2
+        d_combine = sqrt(x * x + y * y + z * z) + 1.0 - min(abs(dot), 1.0)
+
+        up = min(abs(uz), 1.0)
+        clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
+        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.NEAR)))
+        lift = (
+            exp(-d_combine)
+            * exp(-((miss / crane_env.CENTRED) ** 2))
+            * sqrt(min(max(clearance, 0.0), 1.0))
+        )
+        reward = exp(-d_combine) + grasp * q[7] / crane_env.Q8_MAX + 2 * lift
+        if touch[0] > 0 and touch[1] > 0:
+            reward += 3 * (1 - tanh(hypot(*command[:5]))) * lift
+        return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
+
+
+def disagreement(make_act: Callable, kwargs: dict, frame_skip: int) -> tuple[float, float]:
+    """Largest difference of an observation and of a reward between PlainCrane and CraneVectorEnv.
+
+    Two whole episodes by the policy, which grips and lifts in them, two by noise.
+    """
+    envs = crane_env.CraneVectorEnv(4, **kwargs | {"frame_skip": frame_skip})
+    plain = [PlainCrane(frame_skip) for _ in range(4)]
+    obs, _ = envs.reset(seed=list(range(4)))
+    ours = [env.reset(seed=i)[0] for i, env in enumerate(plain)]
+    ended, act, worst = np.zeros(4, bool), make_act(), np.abs(obs - ours).max()
+    hold, worst_reward, rng = 20 // frame_skip, 0.0, np.random.default_rng(0)
+    for decision in range(90 * hold):
+        if decision % hold == 0:
+            actions = np.concatenate([act(obs[:2]), rng.uniform(-1.2, 1.2, (2, 6))])
+        obs, rewards, terminated, truncated, _ = envs.advance(actions)
+        for i in np.flatnonzero(~ended):
+            its_obs, reward, *ends, _ = plain[i].step(actions[i])
+            if ends != [terminated[i], truncated[i]]:
+                sys.exit(f"PlainCrane ends otherwise than CraneVectorEnv, at decision {decision}")
+            worst = max(worst, np.abs(its_obs - obs[i]).max())
+            worst_reward = max(worst_reward, abs(reward - rewards[i]))
+            ended[i] = any(ends)
+    envs.close()
+    return float(worst), float(worst_reward)

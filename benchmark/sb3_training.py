@@ -1,0 +1,137 @@
+"""Stable-Baselines3 (SB3) and sb3-contrib on the crane, timed: throughput.py's other side."""
+
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+import torch
+from plain_crane import PlainCrane
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from crane_env import CraneVectorEnv
+
+# of both sides
+SEED = 1
+CRANES, THREADS = 64, 2  # of CraneVectorEnv
+NETWORK, LSTM, EPOCHS, MINIBATCHES = (256, 256), 64, 8, 4
+LOG_STD = -1.2  # as ours start: wilder ones end more episodes
+
+ARRANGEMENTS = [("Dummy", n) for n in (1, 16, 64)] + [("Subproc", n) for n in (2, 4, 8, 16)]
+START = "fork" if sys.platform == "linux" else None  # workers that start fast and share memory
+
+
+class Training(NamedTuple):
+    rates: list[float]  # decisions/s of each iteration
+    updates: list[float]  # s, the part of the iteration after its rollout
+    threads: int = 1  # of torch
+
+
+class CranesForSB3(VecEnv):
+    """CraneVectorEnv as SB3 wants it."""
+
+    def __init__(self, frame_skip: int):
+        self.envs = CraneVectorEnv(CRANES, frame_skip, signed_yaw=True, env_threads=THREADS)
+        spaces = self.envs.single_observation_space, self.envs.single_action_space
+        super().__init__(CRANES, *spaces)
+
+    def reset(self) -> np.ndarray:
+        return self.envs.reset(seed=SEED)[0]
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
+        obs, reward, terminated, truncated, info = self.envs.step(self.actions)
+        done, infos = terminated | truncated, [{} for _ in range(CRANES)]
+        for i in np.flatnonzero(done):
+            infos[i]["terminal_observation"] = info["final_obs"][i]
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i])
+        return obs, reward, done, infos
+
+    def close(self) -> None:
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list:
+        return [getattr(self.envs, attr_name)] * CRANES
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * CRANES
+
+    def _unused(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError
+
+    set_attr = env_method = _unused
+
+
+class Stopwatch(BaseCallback):
+    """Times SB3: an iteration to warm up, one with 1 and one with 2 threads, on with the better."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.iterations: list[tuple[float, float, int]] = []  # s in all, s of update, threads
+        self.started = False
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self._on_training_end()
+        timed = self.iterations[1:]
+        torch.set_num_threads(2 if len(timed) == 1 else min(timed)[2] if timed else 1)
+        self.start, self.started = time.perf_counter(), True
+
+    def _on_rollout_end(self) -> None:
+        self.update_start = time.perf_counter()
+
+    def _on_training_end(self) -> None:
+        if self.started:
+            now = time.perf_counter()
+            times = now - self.start, now - self.update_start
+            self.iterations.append((*times, torch.get_num_threads()))
+
+
+class CollectOnly(stable_baselines3.PPO):
+    def train(self) -> None:
+        pass
+
+
+def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) -> Training:
+    """Five iterations of SB3 on n cranes, those with the better number of threads."""
+    makers = [partial(PlainCrane, frame_skip)] * n
+    if kind == "Subproc":
+        envs = SubprocVecEnv(makers, start_method=START)
+    else:
+        envs = DummyVecEnv(makers) if kind == "Dummy" else CranesForSB3(frame_skip)
+    policy = {"net_arch": list(NETWORK), "log_std_init": LOG_STD}
+    options = {"n_steps": rollout // n, "batch_size": rollout // MINIBATCHES, "device": "cpu"}
+    options |= {"n_epochs": EPOCHS, "policy_kwargs": policy}
+    maker, network = stable_baselines3.PPO, "MlpPolicy"
+    if algorithm == "collect":
+        maker = CollectOnly
+    elif algorithm == "defaults":
+        options = {"n_steps": rollout, "device": "cpu"}
+    elif algorithm == "TRPO":  # the step as in trpo_crane.py, the critic as above
+        maker = sb3_contrib.TRPO
+        options |= {"n_critic_updates": options.pop("n_epochs"), "target_kl": 0.02}
+    elif algorithm == "RecurrentPPO":  # one memory that actor and critic read, as ours
+        maker, network = sb3_contrib.RecurrentPPO, "MlpLstmPolicy"
+        policy |= {"lstm_hidden_size": LSTM, "shared_lstm": True, "enable_critic_lstm": False}
+    stopwatch = Stopwatch()
+    maker(network, envs, **options).learn(5 * rollout, stopwatch)
+    envs.close()
+    threads = torch.get_num_threads()
+    chosen = [i for i in stopwatch.iterations[1:] if i[2] == threads]
+    return Training([rollout / i[0] for i in chosen], [i[1] for i in chosen], threads)
+
+
+def try_arrangements(frame_skip: int, rollout: int) -> list[Training]:
+    """SB3's PPO that only collects, in each of ARRANGEMENTS."""
+    return [train_sb3("collect", *how, frame_skip, rollout) for how in ARRANGEMENTS]

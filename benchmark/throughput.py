@@ -1,0 +1,446 @@
+"""How fast simulator and training are, beside bare MuJoCo, Gymnasium and Stable-Baselines3 (SB3).
+
+One run on one machine; the cheap measurements take turns, so that a disturbance hits them all.
+Last come the ratios that matter, each with a bar to pass and an aim.
+
+    pip install -r benchmark/requirements.txt
+    python benchmark/throughput.py                      # a quarter of an hour; run nothing else
+    python benchmark/throughput.py --only physics env   # some parts
+    python benchmark/throughput.py --quick              # does it work? its numbers mean nothing
+
+- physics: mujoco.mj_step alone, on the states that the shipped policy visits: the limit.
+- env: CraneVectorEnv driven by that policy, whose own time does not count.
+- vector: the same for Gymnasium's vector environments of `PlainCrane`, after a check that it is
+  the same task.
+- memory: resident memory of CraneVectorEnv per crane.
+- training: rollout and update of our scripts and of SB3, with the same network, rollout, epochs and
+  minibatch. SB3 has its fastest arrangement of environments, the better of 1 and 2 threads, no
+  monitor and no normalised observations; ours have their defaults.
+"""
+
+import csv
+import multiprocessing
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+os.environ["OMP_NUM_THREADS"] = "1"  # in all processes; torch is told its own number
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from plain_crane import PlainCrane, disagreement
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
+
+import crane_env
+import eval_crane
+from crane_env import CraneVectorEnv
+
+try:
+    import psutil
+    import sb3_contrib
+    import sb3_training as sb3
+    import stable_baselines3
+    from sb3_training import CRANES, EPOCHS, LSTM, MINIBATCHES, NETWORK, SEED, THREADS, Training
+except ImportError as error:
+    sys.exit(f"{error.name} is missing: pip install -r benchmark/requirements.txt")
+
+ROOT = Path(__file__).parent.parent
+RESULTS = Path(__file__).parent / "throughput.csv"
+PARTS = ("physics", "env", "vector", "memory", "training")
+HELD_STEPS = 20  # physics steps that an action of the policy holds, at any frame skip
+SCRIPTS = ("mppo_beta", "ppo", "trpo", "recurrent_ppo")
+EPISODES = "mj_step, whole episodes"
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all, with the solver's warm start
+
+
+class Sizes(NamedTuple):
+    repetitions: int
+    decisions: int  # at 10 Hz, of each crane in each repetition
+    cranes: tuple[int, ...]  # of CraneVectorEnv
+    workers: tuple[int, ...]  # of Gymnasium's environments
+    num_steps: int  # decisions per crane and rollout
+
+
+FULL = Sizes(5, 90, (1, 16, 64, 256), (1, 2, 4, 8, 16), 128)  # 90 decisions: an episode
+QUICK = Sizes(2, 3, (1, 64), (1, 2), 8)
+
+
+class Result(NamedTuple):
+    unit: str
+    values: list[float]
+    note: str = ""
+
+
+Results = dict[tuple[str, str, int], Result]  # by part, what, frame skip
+
+
+@dataclass
+class Args:
+    only: tuple[Literal["physics", "env", "vector", "memory", "training"], ...] = PARTS
+    """parts to measure; a ratio between two parts needs both"""
+    quick: bool = False
+    """tiny sizes, to try the script"""
+    csv: Path | None = None
+    """file to write; unset: benchmark/throughput.csv after a full run, none after any other"""
+
+
+# ---- physics, env, vector: cheap, so repeated by turns
+
+
+class Sample(NamedTuple):
+    """A crane before a decision."""
+
+    model: mujoco.MjModel
+    state: np.ndarray
+    ctrl: np.ndarray
+    kind: str  # "free motion", "held log", or "" between them
+
+
+def record(make_act: Callable, kwargs: dict, decisions: int) -> list[Sample]:
+    """The states that `drive` visits with CRANES cranes, one a decision, crane after crane."""
+    envs = CraneVectorEnv(CRANES, **kwargs | {"frame_skip": HELD_STEPS})
+    obs, _ = envs.reset(seed=SEED)
+    act, data, done = make_act(), mujoco.MjData(envs.model), np.ones(CRANES, bool)
+    models: list[Any] = [None] * CRANES
+    samples: list[list[Sample]] = [[] for _ in range(CRANES)]
+    for _ in range(decisions):
+        before = []
+        for i in range(CRANES):
+            models[i] = envs.batch.get_model(i) if done[i] else models[i]  # a new log
+            envs.batch.get_data(i, data)
+            state = np.empty(mujoco.mj_stateSize(models[i], STATE))
+            mujoco.mj_getState(models[i], data, state, STATE)
+            before.append((models[i], state, data.sensordata[12:14] > 0))
+        obs, _, terminated, truncated, info = envs.step(act(obs))
+        done = terminated | truncated
+        for i in np.flatnonzero(~done):  # the controls of an ended episode are gone
+            model, state, touching = before[i]
+            lifted = touching.all() and info["clearance"][i] > crane_env.MIN_CLEARANCE
+            kind = "held log" if lifted else "" if touching.any() else "free motion"
+            ctrl = envs.batch.get_data(i, data).ctrl.copy()
+            samples[i].append(Sample(model, state, ctrl, kind))
+    envs.close()
+    return [sample for crane in samples for sample in crane]
+
+
+def replay(samples: list[Sample]) -> float:
+    """Steps/s of mj_step alone, HELD_STEPS from each sample."""
+    data, elapsed = mujoco.MjData(samples[0].model), 0.0
+    for model, state, ctrl, _ in samples:
+        mujoco.mj_setState(model, data, state, STATE)
+        data.ctrl[:] = ctrl
+        start = time.perf_counter()
+        mujoco.mj_step(model, data, HELD_STEPS)
+        elapsed += time.perf_counter() - start
+    return HELD_STEPS * len(samples) / elapsed
+
+
+def replay_in_threads(samples: list[Sample]) -> float:
+    """Steps/s of THREADS times `replay` at once; mj_step lets go of Python's lock."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        return sum(pool.map(replay, [samples[k::THREADS] for k in range(THREADS)]))
+
+
+def drive(make_envs: Callable, make_act: Callable, decisions: int, frame_skip: int) -> float:
+    """Decisions/s of envs.step alone."""
+    envs = make_envs()
+    obs, _ = envs.reset(seed=SEED)
+    act, hold, elapsed = make_act(), HELD_STEPS // frame_skip, 0.0
+    for step in range(decisions * hold):
+        if step % hold == 0:
+            actions = act(obs)
+        start = time.perf_counter()
+        obs = envs.step(actions)[0]
+        elapsed += time.perf_counter() - start
+    envs.close()
+    return decisions * hold * envs.num_envs / elapsed
+
+
+def env_name(cranes: int = CRANES, threads: int = THREADS, contact: str = "primitive") -> str:
+    return f"CraneVectorEnv {cranes} cranes, {threads} threads, {contact}"
+
+
+def cheap_cells(parts: tuple[str, ...], sizes: Sizes, make_act: Callable, kwargs: dict) -> dict:
+    """What to measure by turns: key to unit, repetitions and function."""
+    cells = {}
+    if "physics" in parts:
+        samples = record(make_act, kwargs, sizes.decisions)
+        runs = {EPISODES: partial(replay, samples)}
+        runs[f"{EPISODES}, {THREADS} threads at once"] = partial(replay_in_threads, samples)
+        for kind in ("free motion", "held log"):
+            selected = [sample for sample in samples if sample.kind == kind]
+            if selected:  # --quick holds no log
+                runs[f"mj_step, {kind}"] = partial(replay, selected)
+        for what, run in runs.items():
+            cells["physics", what, HELD_STEPS] = ("steps/s", sizes.repetitions, run)
+
+    def add(part: str, what: str, skip: int, n: int, make_envs: Callable) -> None:
+        repetitions = min(3, sizes.repetitions) if n > 64 else sizes.repetitions  # they take long
+        run = partial(drive, make_envs, make_act, sizes.decisions * max(1, 4 // n), skip)
+        cells[part, what, skip] = ("decisions/s", repetitions, run)
+
+    for skip in (20, 1):
+        if "env" in parts:
+            kinds = [("primitive", n, threads) for n in sizes.cranes for threads in (1, 2)]
+            for contact, n, threads in [*kinds, ("sdf", CRANES, THREADS)]:
+                own = {"frame_skip": skip, "env_threads": threads, "contact": contact}
+                make = partial(CraneVectorEnv, n, **kwargs | own)
+                add("env", env_name(n, threads, contact), skip, n, make)
+        if "vector" in parts:
+            same = {"autoreset_mode": AutoresetMode.SAME_STEP}  # as CraneVectorEnv
+            for n in sizes.workers:
+                envs = [partial(PlainCrane, skip)] * n
+                add("vector", f"SyncVectorEnv {n}", skip, n, partial(SyncVectorEnv, envs, **same))
+                make = partial(AsyncVectorEnv, envs, context=sb3.START, **same)
+                add("vector", f"AsyncVectorEnv {n}", skip, n, make)
+    return cells
+
+
+# ---- memory and training: each in a process of its own
+
+
+def memory_mb(pid: int) -> float:
+    """Memory of a process and its descendants; what they share counts once where that is known."""
+    total = 0
+    try:
+        parent = psutil.Process(pid)
+        for process in [parent, *parent.children(recursive=True)]:
+            info = process.memory_full_info()
+            total += getattr(info, "pss", info.rss)
+    except psutil.Error:  # one has just ended
+        pass
+    return total / 2**20
+
+
+def answer(connection: Any, function: Callable, args: tuple) -> None:
+    connection.send(function(*args))
+
+
+def in_child(function: Callable, *args: Any) -> tuple[Any, float]:
+    """function(*args) in a fresh process, and the peak of its memory in MB."""
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=answer, args=(sender, function, args))
+    process.start()
+    sender.close()
+    peak = 0.0
+    while not receiver.poll(0.3):
+        peak = max(peak, memory_mb(process.pid))
+    try:
+        result = receiver.recv()
+    except EOFError:
+        raise SystemExit(f"{function.__name__}{args} has failed, see above") from None
+    process.join()
+    return result, peak
+
+
+def resident_mb(num_envs: int) -> float:
+    """Memory of this process when it has used an environment of num_envs cranes."""
+    envs, rng = CraneVectorEnv(num_envs, env_threads=THREADS), np.random.default_rng(SEED)
+    envs.reset(seed=SEED)
+    for _ in range(20):
+        envs.step(rng.uniform(-1, 1, (num_envs, 6)))
+    return psutil.Process().memory_info().rss / 2**20
+
+
+def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, float]:
+    """Four iterations of one of our scripts less the first, and its peak memory in MB."""
+    rollout = CRANES * num_steps
+    flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": 1}
+    flags |= {"frame-skip": frame_skip, "num-steps": num_steps, "update-epochs": EPOCHS}
+    flags |= {"total-timesteps": 4 * rollout, "eval-every": 0, "final-trials": 0}
+    if script == "recurrent_ppo":
+        flags |= {"num-minibatches": MINIBATCHES, "lstm-size": LSTM}
+    else:
+        flags |= {"minibatch-size": rollout // MINIBATCHES}
+    if script != "trpo":
+        flags |= {"target-kl": None}  # all epochs
+    words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
+    words += ["--hidden-sizes", *map(str, NETWORK)]
+    command = [sys.executable, str(ROOT / f"{script}_crane.py"), *words]
+    with tempfile.TemporaryDirectory() as folder, open(Path(folder) / "log", "w+") as log:
+        process, peak = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log), 0.0
+        while process.poll() is None:
+            peak = max(peak, memory_mb(process.pid))
+            time.sleep(0.3)
+        if process.returncode:
+            log.seek(0)
+            raise SystemExit(f"{' '.join(command)} has failed:\n{log.read()[-2000:]}")
+        (run,) = Path(folder).glob("runs/*")
+        events = EventAccumulator(str(run)).Reload()
+    times = [[e.value for e in events.Scalars(f"time/{n}")][1:] for n in ("rollout", "update")]
+    return Training([rollout / sum(pair) for pair in zip(*times)], times[1]), peak
+
+
+def measure_training(results: Results, num_steps: int, bar: tqdm) -> None:
+    def add(what: str, skip: int, training: Training, peak: float, note: str) -> None:
+        note = f"{note}, torch threads {training.threads}"
+        results["training", what, skip] = Result("decisions/s", training.rates, note)
+        results["training", f"{what}, update", skip] = Result("s", training.updates)
+        results["memory", f"{what}, peak", skip] = Result("MB", [peak])
+        bar.update()
+
+    rollout = CRANES * num_steps
+    for skip in (20, 1):
+        for script in SCRIPTS:
+            bar.set_description(script)
+            note = f"{CRANES} cranes, physics threads {THREADS}"
+            add(f"{script}_crane.py", skip, *train_ours(script, skip, num_steps), note)
+        bar.set_description("SB3's arrangements")
+        trials, _ = in_child(sb3.try_arrangements, skip, rollout // 4)
+        for (kind, n), trial in zip(sb3.ARRANGEMENTS, trials):
+            what = f"SB3 PPO collects, {kind}VecEnv {n}"
+            results["training", what, skip] = Result("decisions/s", trial.rates)
+        best = sb3.ARRANGEMENTS[np.argmax([np.median(trial.rates) for trial in trials])]
+        bar.update()
+        for what, job in {
+            "SB3 PPO": ("PPO", *best, skip, rollout),
+            "SB3 PPO on CraneVectorEnv": ("PPO", "Crane", CRANES, skip, rollout),
+            "SB3 PPO as it comes": ("defaults", "Dummy", 1, skip, min(rollout, 2048)),
+            "SB3 TRPO": ("TRPO", *best, skip, rollout),
+            "SB3 RecurrentPPO": ("RecurrentPPO", *best, skip, rollout),
+        }.items():
+            bar.set_description(what)
+            add(what, skip, *in_child(sb3.train_sb3, *job), f"{job[1]}VecEnv {job[2]}")
+
+
+# ---- reports
+
+
+def machine() -> str:
+    cpu = platform.processor()
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((x.split(": ")[1] for x in lines if x.startswith("model name")), cpu)
+    memory = psutil.virtual_memory().total / 2**30
+    libraries = (mujoco, gymnasium, torch, stable_baselines3, sb3_contrib)
+    versions = ", ".join(f"{library.__name__} {library.__version__}" for library in libraries)
+    return (
+        f"{cpu}, {os.cpu_count()} logical cores, {memory:.0f} GB, {platform.platform()}, "
+        f"Python {platform.python_version()}, {versions}"
+    )
+
+
+def table(results: Results) -> list[list]:
+    """Header and rows; steps/s are physics steps."""
+    rows = [["part", "what", "skip", "unit", "median", "min", "max", "n", "steps/s", "note"]]
+    for part, what, skip in sorted(results, key=lambda key: PARTS.index(key[0])):
+        unit, values, note = results[part, what, skip]
+        numbers = [float(f"{x:.4g}") for x in (np.median(values), min(values), max(values))]
+        factor = {"steps/s": 1, "decisions/s": skip}.get(unit)
+        steps = round(factor * numbers[0]) if factor else ""
+        rows.append([part, what, skip, unit, *numbers, len(values), steps, note])
+    return rows
+
+
+def ratios(results: Results) -> list[tuple[str, float, float, float]]:
+    """Name, value, bar and aim of what has been measured; where the aim is lower, less is better.
+
+    The paper trains PPO at 6500 steps/s with 64 cores and a GPU, its recurrent PPO at 0.23 and its
+    TRPO at 0.38 of that speed.
+    """
+
+    def median(part: str, what: str, skip: int = 20) -> float:
+        result = results.get((part, what, skip))
+        return float(np.median(result.values)) if result else np.nan
+
+    env, train = partial(median, "env", env_name()), partial(median, "training")
+    limit = THREADS * median("physics", EPISODES)
+    vector = [median(*key) for key in results if key[0] == "vector" and key[2] == 1]
+    found = [
+        (f"env steps/s / {THREADS} x mj_step, skip 20", 20 * env(20) / limit, 0.95, 1.0),
+        (f"env steps/s / {THREADS} x mj_step, skip 1", env(1) / limit, 0.6, 0.8),
+        ("env / Sync or AsyncVectorEnv, skip 1", env(1) / max(vector, default=np.nan), 4, 8),
+    ]
+    ppo, trpo, recurrent = (f"{script}_crane.py" for script in ("ppo", "trpo", "recurrent_ppo"))
+    for one, other, bars in [
+        (ppo, "SB3 PPO", {20: (1.8, 3), 1: (2, 4)}),
+        (ppo, "SB3 PPO on CraneVectorEnv", {20: (1.2, 2), 1: (1.2, 2)}),
+        (trpo, "SB3 TRPO", {20: (1.5, 3), 1: (1.5, 3)}),
+        (recurrent, "SB3 RecurrentPPO", {20: (1.5, 3), 1: (1.5, 3)}),
+        (recurrent, ppo, {20: (0.4, 0.7), 1: (0.4, 0.7)}),
+        (trpo, ppo, {20: (0.7, 1), 1: (0.7, 1)}),
+    ]:
+        for skip, bounds in bars.items():
+            value = train(one, skip) / train(other, skip)
+            found.append((f"{one} / {other}, skip {skip}", value, *bounds))
+    found.append((f"{ppo} steps/s / 6500, skip 1", train(ppo, 1) / 6500, 0.8, 1.2))
+    found.append(("MB per added crane", median("memory", "per added crane"), 1, 0.3))
+    return [row for row in found if not np.isnan(row[1])]
+
+
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    full = not args.quick and set(args.only) == set(PARTS)
+    path = args.csv or (RESULTS if full else None)
+    if path and not path.parent.is_dir():
+        raise SystemExit(f"--csv: no folder {path.parent}; make it first")
+    sizes = QUICK if args.quick else FULL
+    torch.set_num_threads(1)
+    print(machine())
+    make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic=False)
+    if {"vector", "training"} & set(args.only):
+        for skip in (20, 1):
+            obs, reward = disagreement(make_act, kwargs, skip)
+            print(f"PlainCrane beside CraneVectorEnv, skip {skip}: apart by {max(obs, reward):.0e}")
+            if max(obs, reward) > 1e-3:
+                raise SystemExit("PlainCrane is another task than CraneVectorEnv")
+
+    results: Results = {}
+    cells = cheap_cells(args.only, sizes, make_act, kwargs)
+    total = sum(repetitions for _, repetitions, _ in cells.values())
+    total += ("memory" in args.only) + 20 * ("training" in args.only)
+    with tqdm(total=total) as bar:
+        for repetition in range(sizes.repetitions):
+            for key, (unit, repetitions, run) in cells.items():
+                if repetition < repetitions:
+                    bar.set_description(key[1])
+                    results.setdefault(key, Result(unit, [])).values.append(run())
+                    bar.update()
+        if "memory" in args.only:
+            bar.set_description("memory")
+            counts = (1, 64, 256)
+            used = [in_child(resident_mb, n)[0] for n in counts]
+            for n, megabytes in zip(counts, used):
+                results["memory", f"CraneVectorEnv {n} cranes", 20] = Result("MB", [megabytes])
+            slope = float(np.polyfit(counts, used, 1)[0])
+            results["memory", "per added crane", 20] = Result("MB", [slope])
+            bar.update()
+        if "training" in args.only:
+            measure_training(results, sizes.num_steps, bar)
+
+    rows = table(results)
+    for part, what, skip, unit, *numbers, steps, note in rows:
+        print(f"{part:<8} {what:<50} {skip:>4} {unit:<11}", *(f"{x:>9}" for x in numbers), end=" ")
+        print(f"{steps:>8}  {note}")
+    print(f"\n{'ratio':<60} {'value':>6} {'bar':>5} {'aim':>5}")
+    for name, value, bar, aim in ratios(results):
+        reached = [value <= x if aim < bar else value >= x for x in (aim, bar)]
+        verdict = "aim met" if reached[0] else "bar met" if reached[1] else "MISSED"
+        print(f"{name:<60} {value:>6.2f} {bar:>5} {aim:>5}  {verdict}")
+    if path:
+        unfinished = path.with_suffix(".tmp")
+        with open(unfinished, "w", newline="") as file:
+            file.write(f"# {machine()}\n")
+            csv.writer(file).writerows(rows)
+        os.replace(unfinished, path)
+        print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()
