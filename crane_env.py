@@ -66,6 +66,7 @@ from mujoco.batch import Batch, SimulationError
 from numpy.random import Generator, SeedSequence, default_rng
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
+REVISION = 4  # of the task; raise it when a change spoils policies or checkpoints
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators
 LOG_LENGTH = 2.75  # m
@@ -77,10 +78,10 @@ TIME_LIMIT = 9.0  # s
 REACH_TIME = 6.0  # s
 REACH_DISTANCE = 0.35  # m, bound of d_combine
 LOG_RANGE = 8.0  # m, between grapple centre and log centre
-Q7_MAX = 2.8  # rad, where the rotator may be sent
+ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
-NEAR = 0.2  # m, d_combine within which the staged r_grapple counts in full
+GRASP_DISTANCE = 0.2  # m, d_combine within which the staged r_grapple counts in full
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
 HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
@@ -203,7 +204,8 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
     log's diameter d (README, errata), which offset "plus" adds and "minus" subtracts. The signed
     angle turns the grapple's axis into the log's, a line without direction: the shorter turn, or
-    the other one where the shorter would end within 0.34 rad of the rotator's end stop or beyond.
+    the other one where the shorter would take the rotator beyond ROTATOR_MAX. A hanging grapple's
+    yaw is that of q1 - q7.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
@@ -213,8 +215,9 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     cross = axis[:, 0] * log[:, 1] - axis[:, 1] * log[:, 0]
     signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
     slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
+    slew = (slew + np.pi) % (2 * np.pi) - np.pi
     rotator = state.q[:, 6] + slew - signed_angle  # once the crane faces the log
-    signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > Q7_MAX)
+    signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > ROTATOR_MAX)
     return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
 
 
@@ -261,7 +264,7 @@ def reward_terms(
         r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
         r_balance = calm * (1 - r_lift)
     else:
-        r_grapple = 2 * np.minimum(1, np.exp(-3 * omega2 * (d_combine - NEAR))) * closed
+        r_grapple = 2 * np.minimum(1, np.exp(-3 * omega2 * (d_combine - GRASP_DISTANCE))) * closed
         centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
         lift = r_distance * centred * np.sqrt(np.clip(log_clearance(state), 0, 1))
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))

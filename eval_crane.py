@@ -97,10 +97,9 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
     module = ALGORITHMS[algorithm]
     known = {field.name for field in fields(module.Args)}
-    if args.keys() != known:
-        names = ", ".join(sorted(map(str, args.keys() ^ known)))
+    if saved.get("task") != crane_env.REVISION or args.keys() != known:
         print(
-            f"{path} is of another revision, which may matter; differs in: {names}", file=sys.stderr
+            f"{path} is of another revision of this repository; judged by today's", file=sys.stderr
         )
     try:
         args = module.Args(**{key: value for key, value in args.items() if key in known})
@@ -108,9 +107,9 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         agent = module.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
         if on_crane:
             agent.load_state_dict(weights)
-    except Exception as error:
-        reason = str(error).splitlines()[-1].strip()
-        raise SystemExit(f"{path}: weights do not fit a {algorithm} policy: {reason}") from None
+    except Exception as error:  # whatever a damaged file may raise
+        reason = (str(error).splitlines() or [repr(error)])[-1].strip()
+        raise SystemExit(f"{path} does not fit a {algorithm} policy: {reason}") from None
     if not on_crane:
         raise SystemExit(f"{path} was trained on {args.env_id}, not on the crane")
 
@@ -242,26 +241,30 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     skip = kwargs.pop("frame_skip", 20)
     substeps = 2 if skip % 20 == 0 else 1
     frame_every = max(1, round(10 / (skip // substeps)))
-    fps = round(1 / (frame_every * skip // substeps * crane_env.TIMESTEP))
+    dt = skip // substeps * crane_env.TIMESTEP
+    fps = round(1 / (frame_every * dt))
     gif = args.video.suffix == ".gif"
     options = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
     size = {"width": args.width, "height": args.width * 9 // 32 * 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
-    with imageio.get_writer(unfinished, **options) as video:
-        for diameter, seed in zip(tqdm(diameters, desc="trials filmed"), seeds):
-            envs = CraneVectorEnv(1, skip // substeps, diameter=diameter, **size, **kwargs)
-            obs, _ = envs.reset(seed=[seed])
-            act, ended, step = make_act(), False, 0
-            while not ended:
-                if step % substeps == 0:
-                    actions = act(obs)
-                obs, _, terminated, truncated, _ = envs.advance(actions)
-                if step % frame_every == 0:
-                    video.append_data(envs.render_crane(0, args.camera))
-                ended, step = terminated[0] or truncated[0], step + 1
-            envs.close()
-    os.replace(unfinished, args.video)
+    try:
+        with imageio.get_writer(unfinished, **options) as video:
+            for diameter, seed in zip(tqdm(diameters, desc="trials filmed"), seeds):
+                envs = CraneVectorEnv(1, skip // substeps, diameter=diameter, **size, **kwargs)
+                obs, _ = envs.reset(seed=[seed])
+                act, ended, step = make_act(), False, 0
+                while not ended:
+                    if step % substeps == 0:
+                        actions = act(obs)
+                    obs, _, terminated, truncated, _ = envs.advance(actions)
+                    if step % frame_every == 0:
+                        video.append_data(envs.render_crane(0, args.camera))
+                    ended, step = terminated[0] or truncated[0], step + 1
+                envs.close()
+        os.replace(unfinished, args.video)
+    finally:
+        unfinished.unlink(missing_ok=True)
     print(f"{len(seeds)} trials filmed in {args.video}")
 
 

@@ -101,11 +101,11 @@ class Args:
     eval_seed: int = 10_000  # seed of all evaluation trials
 
 
-# the smallest values that mean something
-LEAST = dict(total_timesteps=1, num_envs=1, num_steps=1, hidden_sizes=1, learning_rate=0)
-LEAST |= dict(minibatch_size=1, update_epochs=1)
-LEAST |= dict(frame_skip=1, torch_threads=1, env_threads=0, seed=0, eval_seed=0, eval_every=0)
-LEAST |= dict(eval_trials=1, final_trials=0, horizon_growth=1, max_grad_norm=0)
+LEAST = {  # the smallest values of arguments that have one
+    0: "seed env_threads learning_rate eval_every final_trials eval_seed",
+    1: "total_timesteps torch_threads num_envs frame_skip num_steps hidden_sizes horizon_growth "
+    "minibatch_size update_epochs eval_trials",
+}
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
 PAPER = Args(
@@ -178,7 +178,7 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
-        """obs in running standard deviations, as all but `predict` take them."""
+        """(obs - mean) / std within +-10, what the networks take; `predict` takes raw ones."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
@@ -298,15 +298,17 @@ if __name__ == "__main__":
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        if saved.keys() != asdict(args).keys():
+        task = checkpoint.get("task")
+        if saved.keys() != asdict(args).keys() or task != crane_env.REVISION:
             raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
         args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
-    for name, least in LEAST.items():
-        if np.min(getattr(args, name), initial=least) < least:
-            raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
+    for least, names in LEAST.items():
+        for name in names.split():
+            if not np.all(np.asarray(getattr(args, name)) >= least):
+                raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
     if not (0 <= args.gamma < 1 and 0 <= args.gae_lambda <= 1):
         raise SystemExit("--gamma must lie in [0, 1) and --gae-lambda in [0, 1]")
     batch_size = args.num_envs * args.num_steps
@@ -352,6 +354,7 @@ if __name__ == "__main__":
     def save(iteration: int) -> None:
         policy = {
             "algorithm": ALGORITHM,
+            "task": crane_env.REVISION,
             "args": asdict(args),
             "weights": agent.state_dict(),
             "global_step": iteration * batch_size,
@@ -419,7 +422,8 @@ if __name__ == "__main__":
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
                         cut_at.append((step, i))
-                        cut_obs.append(info["final_obs"][i].astype(np.float32))
+                        last_obs = torch.as_tensor(info["final_obs"][i], dtype=torch.float32)
+                        cut_obs.append(agent.normalize(last_obs.to(device)))
                     ended["return"].append(episodic_return[i])
                     ended["length"].append(episodic_length[i])
                     if is_crane(args):
@@ -441,8 +445,7 @@ if __name__ == "__main__":
                 b_logprobs = agent.get_distribution(b_obs).log_prob(b_actions).sum(-1)
                 last_value, cut_values = agent.get_value(agent.normalize(next_obs)), None
                 if cut_at:
-                    last_obs = torch.as_tensor(np.stack(cut_obs), device=device)
-                    cut_values = agent.get_value(agent.normalize(last_obs))
+                    cut_values = agent.get_value(torch.stack(cut_obs))
                 next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
                 advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
                 returns = advantages + values

@@ -107,11 +107,11 @@ class Args:
     eval_seed: int = 10_000  # seed of all evaluation trials
 
 
-# the smallest values that mean something
-LEAST = dict(total_timesteps=1, num_envs=1, num_steps=1, hidden_sizes=1, learning_rate=0)
-LEAST |= dict(num_minibatches=1, update_epochs=1, lstm_size=1)
-LEAST |= dict(frame_skip=1, torch_threads=1, env_threads=0, seed=0, eval_seed=0, eval_every=0)
-LEAST |= dict(eval_trials=1, final_trials=0, horizon_growth=1, max_grad_norm=0)
+LEAST = {  # the smallest values of arguments that have one
+    0: "seed env_threads learning_rate eval_every final_trials eval_seed",
+    1: "total_timesteps torch_threads num_envs frame_skip num_steps hidden_sizes horizon_growth "
+    "lstm_size num_minibatches update_epochs eval_trials",
+}
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
 PAPER = Args(
@@ -186,7 +186,7 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
-        """obs in running standard deviations, as all but `predict` take them."""
+        """(obs - mean) / std within +-10, what the networks take; `predict` takes raw ones."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
@@ -333,15 +333,17 @@ if __name__ == "__main__":
             ours = False
         if not ours:
             raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        if saved.keys() != asdict(args).keys():
+        task = checkpoint.get("task")
+        if saved.keys() != asdict(args).keys() or task != crane_env.REVISION:
             raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
         args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
-    for name, least in LEAST.items():
-        if np.min(getattr(args, name), initial=least) < least:
-            raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
+    for least, names in LEAST.items():
+        for name in names.split():
+            if not np.all(np.asarray(getattr(args, name)) >= least):
+                raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
     if not (0 <= args.gamma < 1 and 0 <= args.gae_lambda <= 1):
         raise SystemExit("--gamma must lie in [0, 1) and --gae-lambda in [0, 1]")
     if args.num_envs % args.num_minibatches:
@@ -390,6 +392,7 @@ if __name__ == "__main__":
     def save(iteration: int) -> None:
         policy = {
             "algorithm": ALGORITHM,
+            "task": crane_env.REVISION,
             "args": asdict(args),
             "weights": agent.state_dict(),
             "global_step": iteration * batch_size,
@@ -462,7 +465,8 @@ if __name__ == "__main__":
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
                         cut_at.append((step, i))
-                        cut_obs.append(info["final_obs"][i].astype(np.float32))
+                        last_obs = torch.as_tensor(info["final_obs"][i], dtype=torch.float32)
+                        cut_obs.append(agent.normalize(last_obs.to(device)))
                         cut_states.append(torch.stack([part[i] for part in state]))
                     ended["return"].append(episodic_return[i])
                     ended["length"].append(episodic_length[i])
@@ -484,14 +488,14 @@ if __name__ == "__main__":
                 values = agent.get_value(features)
                 logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
                 # looks ahead of the live state, which goes on from where it is
-                scaled = agent.normalize(next_obs)[None]
-                features, _ = agent.remember(scaled, state, next_start[None])
+                ahead = agent.normalize(next_obs)[None]
+                features, _ = agent.remember(ahead, state, next_start[None])
                 last_value, cut_values = agent.get_value(features[0]), None
                 if cut_at:
-                    last_obs = torch.as_tensor(np.stack(cut_obs), device=device)
-                    scaled = agent.normalize(last_obs)[None]
+                    last_obs = torch.stack(cut_obs)[None]
                     h, c = torch.stack(cut_states, dim=1)
-                    features, _ = agent.remember(scaled, (h, c), torch.zeros_like(scaled[..., 0]))
+                    no_starts = torch.zeros_like(last_obs[..., 0])
+                    features, _ = agent.remember(last_obs, (h, c), no_starts)
                     cut_values = agent.get_value(features[0])
                 next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
                 advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)

@@ -53,7 +53,7 @@ MAX_KL, CG_DAMPING, CG_ITERATIONS, CRITIC_LEARNING_RATE = 0.01, 0.1, 15, 1e-3  #
 
 @dataclass
 class Args:
-    tasks: tuple[Literal["Pendulum-v1", "HalfCheetah-v5"], ...] = ("Pendulum-v1", "HalfCheetah-v5")
+    tasks: tuple[Literal[*TASKS], ...] = tuple(TASKS)
     """Gymnasium tasks"""
     algorithms: tuple[Literal["ppo", "mppo_beta", "trpo"], ...] = ("ppo", "mppo_beta", "trpo")
     """ours; SB3 has no Beta policy: its PPO stands there"""
@@ -168,14 +168,16 @@ def train_sb3(task: str, algorithm: str, seed: int):
 if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__)
     rows = list(csv.DictReader(open(RESULTS))) if RESULTS.exists() else []
-    done = {(r["task"], r["algorithm"], r["library"], int(r["seed"])) for r in rows}
+    done = {
+        (r["task"], r["algorithm"], r["library"], int(r["seed"]), int(r["steps"])) for r in rows
+    }
     for task in args.tasks:
         for seed in args.seeds:
             for algorithm in args.algorithms:
                 for library, train in (("ours", train_ours), ("sb3", train_sb3)):
                     if library == "sb3" and algorithm == "mppo_beta":
                         continue
-                    if (task, algorithm, library, seed) in done:
+                    if (task, algorithm, library, seed, TASKS[task].steps) in done:
                         continue
                     start = time.time()
                     act = train(task, algorithm, seed)

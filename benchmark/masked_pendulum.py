@@ -26,10 +26,12 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "masked_pendulum.csv"
 COLUMNS = ["algorithm", "seed", "steps", "mean_return"]
 EPISODES = 20
-BATCH = 32 * 128  # decisions of a rollout
-COMMON = """--env-id masked_pendulum:MaskedPendulum-v1 --num-envs 32 --num-steps 128 --gamma 0.9
---reward-scale 0.1 --learning-rate 1e-3 --update-epochs 10 --hidden-sizes 64 64 --log-std-init 0
---horizon-growth 1 --narrowing 0 --eval-every 5"""
+NUM_ENVS, NUM_STEPS = 32, 128
+BATCH = NUM_ENVS * NUM_STEPS
+COMMON = f"""--env-id masked_pendulum:MaskedPendulum-v1
+--num-envs {NUM_ENVS} --num-steps {NUM_STEPS} --gamma 0.9 --reward-scale 0.1 --learning-rate 1e-3
+--update-epochs 10 --hidden-sizes 64 64 --log-std-init 0 --horizon-growth 1 --narrowing 0
+--eval-every 5"""
 OWN = {"ppo": "--minibatch-size 512", "recurrent_ppo": "--num-minibatches 8"}
 
 

@@ -117,15 +117,15 @@ class PlainCrane(gymnasium.Env):
         level = max(hypot(ux, uy), 1e-9)
         dot, cross = (ax * ux + ay * uy) / level, (ax * uy - ay * ux) / level
         angle = (atan2(cross, dot) + pi / 2) % pi - pi / 2
-        rotator = q[6] + atan2(ly, lx) - q[0] - angle
-        if abs(rotator) > crane_env.Q7_MAX:
+        rotator = q[6] + (atan2(ly, lx) - q[0] + pi) % (2 * pi) - pi - angle
+        if abs(rotator) > crane_env.ROTATOR_MAX:
             angle += copysign(pi, rotator)
         z += (crane_env.D_MAX - self.diameter) / 2
         d_combine = sqrt(x * x + y * y + z * z) + 1.0 - min(abs(dot), 1.0)
 
         up = min(abs(uz), 1.0)
         clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.NEAR)))
+        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.GRASP_DISTANCE)))
         lift = (
             exp(-d_combine)
             * exp(-((miss / crane_env.CENTRED) ** 2))

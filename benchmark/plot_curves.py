@@ -1,7 +1,7 @@
-"""Draw benchmark/curves/*.csv into assets/figures/learning_curves.png; say when each run was there.
+"""Draw benchmark/curves/*.csv into assets/figures/learning_curves.png; say when each run got there.
 
-There is the first evaluation at or above the paper's 96.3 % after which none falls below 95 %;
-minutes are those of rollouts and updates, without evaluations, as the run was run.
+A run is there with the first evaluation at or above the paper's 96.3 % after which none falls below
+95 %; minutes are those of rollouts and updates, without evaluations, as the run was run.
 
     python benchmark/plot_curves.py
 """

@@ -75,7 +75,7 @@ def test_acting_step_by_step_is_acting_on_the_sequence():
     agent, (obs, _, _) = make_agent(), sequence()
     state = agent.initial_state(3)
     starts = torch.zeros(12, 3)
-    features, _ = agent.remember(obs, state, starts)
+    features, _ = agent.remember(agent.normalize(obs), state, starts)
     expected = agent.to_env(agent.get_distribution(features).mean)
     for t in range(12):
         actions, state = agent.predict(obs[t], state)

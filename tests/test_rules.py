@@ -46,16 +46,27 @@ def test_angle_is_that_of_a_line_not_of_an_arrow():
     np.testing.assert_allclose(signed, [0.1 - np.arctan2(0.8, 0.6)])
 
 
-def test_angle_keeps_the_rotator_off_its_end_stop():
-    """Facing the log (slew as its azimuth), a rotator at 2.6 rad that is 0.5 rad off turns back."""
-    log = dict(log_centre=[0.0, -6.0, 0.2], log_axis=[np.cos(-0.5), np.sin(-0.5), 0.0])
-    grapple = dict(grapple_centre=[0.0, -6.0, 1.5], grapple_axis=[1.0, 0.0, 0.0])
-    for q7, expected in [(2.0, -0.5), (2.6, np.pi - 0.5), (-2.6, -0.5)]:
-        q = np.array([-np.pi / 2, 0.5, 0.2, 0.5, 0.87, np.pi / 2, q7, 1.5])
-        _, _, signed = crane_env.relative_pose(state(q=q, **log, **grapple))
-        # turning the grapple by the angle turns the rotator, which hangs head down, by as much back
-        np.testing.assert_allclose(signed, [expected])
-        assert abs(q7 - signed[0]) < 2.8
+def test_signed_angle_turns_the_grapple_onto_the_log_within_the_rotators_range():
+    envs = CraneVectorEnv(300)
+    envs.reset(seed=0)
+    before = envs._state()
+    _, _, signed = crane_env.relative_pose(before)
+    assert signed.max() > np.pi / 2 and signed.min() < -np.pi / 2  # the longer turn, both ways
+    q, ids = before.q.copy(), np.arange(300)
+    q[:, 4], q[:, 5] = np.pi / 2 - q[:, 1] - q[:, 2], np.pi / 2  # plumb
+    x, y = before.log_centre[:, :2].T
+    log_yaw = np.arctan2(before.log_axis[:, 1], before.log_axis[:, 0]) - np.pi / 2
+    log = np.stack([x, y, log_yaw], axis=-1)
+    envs.place(ids, q, log, before.diameter)
+    _, _, signed = crane_env.relative_pose(envs._state())
+    turn = np.arctan2(y, x) - q[:, 0]  # until the crane faces the log
+    q[:, 0] += turn
+    q[:, 6] += turn - signed  # the grapple's yaw is that of q1 - q7
+    envs.place(ids, q, log, before.diameter)
+    _, delta_psi, left = crane_env.relative_pose(envs._state())
+    np.testing.assert_allclose(delta_psi, 0, atol=1e-6)
+    np.testing.assert_allclose(left, 0, atol=1e-3)
+    assert np.abs(q[:, 6]).max() < 2.81
 
 
 def test_yaw_of_a_tilted_log_is_that_of_its_shadow():

@@ -77,6 +77,27 @@ def test_normalizer_is_the_mean_and_variance_of_all_it_saw(algorithm):
     torch.testing.assert_close(agent.obs_var, variance, atol=1e-3, rtol=1e-3)
 
 
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_predict_takes_raw_observations_and_the_networks_normalised_ones(algorithm):
+    torch.manual_seed(0)
+    scripts = module(algorithm)
+    agent = scripts.Agent(18, np.full(6, -1.0), np.full(6, 1.0), scripts.Args(hidden_sizes=(8,)))
+    torch.nn.init.orthogonal_(agent.actor[-1].weight)
+    obs = 5 + 3 * torch.randn(100, 18)
+    agent.update_normalizer(obs)
+    if algorithm == "recurrent_ppo":
+        actions, _ = agent.predict(obs, agent.initial_state(100))
+        starts = torch.zeros(1, 100)
+        features, _ = agent.remember(agent.normalize(obs)[None], agent.initial_state(100), starts)
+        expected = agent.get_distribution(features[0]).mean
+    else:
+        actions = agent.predict(obs)
+        expected = agent.get_distribution(agent.normalize(obs)).mean
+        raw = agent.to_env(agent.get_distribution(obs).mean)
+        assert (raw - actions).abs().max() > 0.1
+    torch.testing.assert_close(actions, agent.to_env(expected))
+
+
 SHARED = "layer_init bootstrap_values compute_gae crane_kwargs is_crane make_envs save_atomically"
 
 
@@ -281,6 +302,14 @@ def test_clear_errors(tmp_path, algorithm):
         ("--resume old.pt", "old.pt is of another revision"),
         ("--num-envs 0", "--num-envs must be at least 1"),
         (ONE_SAMPLE[algorithm], "standard deviation"),
+    ]:
+        result = run(algorithm, tmp_path, *arguments.split(), check=False)
+        assert result.returncode == 1 and "Traceback" not in result.stderr
+        assert message in result.stderr
+
+
+def test_clear_errors_of_what_the_scripts_share(tmp_path):
+    for arguments, message in [
         ("--seed -1", "--seed must be at least 0"),
         ("--hidden-sizes 8 0", "--hidden-sizes must be at least 1"),
         ("--gamma 1", "--gamma must lie in [0, 1)"),
@@ -288,8 +317,8 @@ def test_clear_errors(tmp_path, algorithm):
         ("--horizon-growth 0", "--horizon-growth must be at least 1"),
         ("--env-id CartPole-v1", "no flat Box"),
         ("--env-id Pendulum-v77", "Pendulum-v77"),
-    ][: 12 if algorithm == "mppo_beta" else 5]:
-        result = run(algorithm, tmp_path, *arguments.split(), check=False)
+    ]:
+        result = run("mppo_beta", tmp_path, *arguments.split(), check=False)
         assert result.returncode == 1 and "Traceback" not in result.stderr
         assert message in result.stderr
 
