@@ -44,7 +44,7 @@ class Task:
 
 TASKS = {
     "Pendulum-v1": Task(102_400, 4, 1024, 64, 0.9, 1e-3, 0.1),
-    "HalfCheetah-v5": Task(299_008, 1, 2048, 64, 0.99, 3e-4, 0.1),
+    "HalfCheetah-v5": Task(100_352, 1, 2048, 64, 0.99, 3e-4, 0.1),
 }
 HIDDEN = (64, 64)
 EPOCHS, GAE_LAMBDA, CLIP = 10, 0.95, 0.2
