@@ -5,7 +5,7 @@ sides, normalised observations, rewards by the same constant; final policies jud
 action in 20 episodes of the same seeds. Appends to benchmark/compare_sb3.csv and skips the rows it
 finds there.
 
-    pip install stable-baselines3 sb3-contrib
+    pip install -r benchmark/requirements.txt
     python benchmark/compare_sb3.py --help
 """
 
