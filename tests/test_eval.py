@@ -159,17 +159,18 @@ def test_video(tmp_path):
     assert np.std(frames[0]) > 10
 
 
-def test_clear_errors(tmp_path):
+def test_clear_errors(tmp_path, monkeypatch):
     def error_of(*arguments):
-        result = run(*arguments)
-        assert result.returncode != 0 and "Traceback" not in result.stderr
-        return result.stderr
+        monkeypatch.setattr(sys, "argv", ["eval_crane.py", *map(str, arguments)])
+        with pytest.raises(SystemExit) as error:
+            eval_crane.main()
+        return str(error.value)
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
     assert "at least one number" in error_of("--diameters")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
     assert "brings its own" in error_of("--no-signed-yaw")
-    assert "--width must lie in" in error_of("--video", "lift.mp4", "--width", "4000")
+    assert "--width must be even and lie in" in error_of("--video", "lift.mp4", "--width", "4000")
     assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
     (tmp_path / "junk.pt").write_bytes(b"junk")
     assert "is no policy.pt of this repository" in error_of(tmp_path / "junk.pt")
@@ -178,9 +179,26 @@ def test_clear_errors(tmp_path):
     assert "unknown algorithm 'sac'; known: mppo_beta, ppo" in error_of(tmp_path / "sac.pt")
     args = {**saved["args"], "hidden_sizes": (8, 8)}
     torch.save({**saved, "args": args}, tmp_path / "shape.pt")
-    assert "weights do not fit" in error_of(tmp_path / "shape.pt")
+    assert "does not fit a mppo_beta policy" in error_of(tmp_path / "shape.pt")
+    torch.save({**saved, "weights": 3}, tmp_path / "weights.pt")
+    assert "does not fit a mppo_beta policy" in error_of(tmp_path / "weights.pt")
+    torch.save({**saved, "args": 3}, tmp_path / "args.pt")
+    assert "is no policy.pt" in error_of(tmp_path / "args.pt")
     args = {**saved["args"], "env_id": "Pendulum-v1"}
     torch.save({**saved, "args": args}, tmp_path / "pendulum.pt")
     assert "trained on Pendulum-v1" in error_of(tmp_path / "pendulum.pt")
     assert "must lie in [0.3, 0.8]" in error_of("--diameters", "0.2", "--policy", "zero")
     assert "--trials must be at least 1" in error_of("--trials", "0")
+    assert "--seed must be at least 0" in error_of("--seed", "-1")
+    assert "--width must be even" in error_of("--video", "lift.mp4", "--width", "321")
+    assert "PATH goes with" in error_of(tmp_path / "junk.pt", "--policy", "zero")
+    assert "--stochastic goes with" in error_of("--policy", "random", "--stochastic")
+    assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
+    assert "is a folder" in error_of("--csv", tmp_path)
+
+
+def test_policy_of_another_revision_is_called_so(tmp_path, capsys):
+    saved = torch.load(eval_crane.SHIPPED, weights_only=True)
+    torch.save({**saved, "task": -1}, tmp_path / "old.pt")
+    eval_crane.load_policy(tmp_path / "old.pt", stochastic=False)
+    assert "old.pt is of another revision" in capsys.readouterr().err
