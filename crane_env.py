@@ -81,7 +81,6 @@ LOG_RANGE = 8.0  # m, between grapple centre and log centre
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
-GRASP_DISTANCE = 0.2  # m, d_combine within which the staged r_grapple counts in full
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
 HOLD_TIME = 0.5  # s at the end of the episode
 MIN_CLEARANCE = 0.1  # m below the log's lowest point
@@ -264,7 +263,7 @@ def reward_terms(
         r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
         r_balance = calm * (1 - r_lift)
     else:
-        r_grapple = 2 * np.minimum(1, np.exp(-3 * omega2 * (d_combine - GRASP_DISTANCE))) * closed
+        r_grapple = 2 * np.minimum(1, np.exp(-3 * omega2 * (d_combine - REACH_DISTANCE))) * closed
         centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
         lift = r_distance * centred * np.sqrt(np.clip(log_clearance(state), 0, 1))
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))

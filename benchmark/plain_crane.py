@@ -125,7 +125,7 @@ class PlainCrane(gymnasium.Env):
 
         up = min(abs(uz), 1.0)
         clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.GRASP_DISTANCE)))
+        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
         lift = (
             exp(-d_combine)
             * exp(-((miss / crane_env.CENTRED) ** 2))

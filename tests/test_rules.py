@@ -102,24 +102,24 @@ COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaw
 
 def test_staged_reward():
     lifted = {"log_centre": [4.0, 6.0, 0.45], "grapple_centre": [4.3, 6.125, 0.8]}
-    terms = crane_env.reward_terms(state(**lifted), np.array([0.25]), COMMAND, omega2=2.0)
-    r, grasp = np.exp(-0.5), 2 * 0.5 * np.exp(-0.3)  # q8 / 3 = 0.5; 0.05 m farther than 0.2 m
+    terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
+    r, grasp = np.exp(-0.8), 2 * 0.5 * np.exp(-0.3)  # q8 / 3 = 0.5; 0.05 m farther than 0.35 m
     # 0.125 m off the centre, half of 0.25 m; clearance 0.45 - 0.2 = 0.5^2
     centred, calm = np.exp(-0.25), 1 - np.tanh(0.5)
     np.testing.assert_allclose(
         terms, [[r, grasp, 2 * 0.5 * r * centred, 3 * calm * 0.5 * r * centred]]
     )
     lifted["grapple_centre"] = [4.0, 7.0, 0.45]
-    terms = crane_env.reward_terms(state(**lifted), np.array([0.25]), COMMAND, omega2=2.0)
+    terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [[r, grasp, 0.0, 0.0]], atol=1e-6)
     one_jaw = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[True, False])
-    terms = crane_env.reward_terms(one_jaw, np.array([0.25]), COMMAND, omega2=2.0)
+    terms = crane_env.reward_terms(one_jaw, np.array([0.4]), COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [[r, grasp, 2 * 0.5 * r, 0.0]])
     high = state(log_centre=[4.0, 6.0, 3.2], grapple_centre=[4.0, 6.0, 3.2])
     terms = crane_env.reward_terms(high, np.array([0.25]), COMMAND)
     np.testing.assert_allclose(terms[0, 2], 2 * np.exp(-0.25))  # clearance counts up to 1 m
-    near = crane_env.reward_terms(high, np.array([0.19]), COMMAND)
-    np.testing.assert_allclose(near[0, 1], 1.0)  # nearer than 0.2 m is no better for r_grapple
+    near = crane_env.reward_terms(high, np.array([0.34]), COMMAND)
+    np.testing.assert_allclose(near[0, 1], 1.0)  # nearer than 0.35 m is no better for r_grapple
 
 
 def test_paper_reward():
