@@ -237,12 +237,12 @@ def start(algorithm, cwd, *arguments):
         # where the tests run in the background, Ctrl-C is ignored, and children inherit that
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    for _ in range(1200):
+    for _ in range(6000):
         if list(Path(cwd).glob("runs/*/checkpoint.pt")):
             return process
         assert process.poll() is None, process.stderr.read()[-2000:]
         time.sleep(0.05)
-    raise AssertionError("no checkpoint after a minute")
+    raise AssertionError("no checkpoint after five minutes")
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
