@@ -338,8 +338,8 @@ if __name__ == "__main__":
         for name in names.split():
             if not np.all(np.asarray(getattr(args, name)) >= least):
                 raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
-    if not (0 <= args.gamma < 1 and 0 <= args.gae_lambda <= 1):
-        raise SystemExit("--gamma must lie in [0, 1) and --gae-lambda in [0, 1]")
+    if not (0 <= args.gamma <= 1 and 0 <= args.gae_lambda <= 1):
+        raise SystemExit("--gamma and --gae-lambda must lie in [0, 1]")
     batch_size = args.num_envs * args.num_steps
     num_minibatches = -(-batch_size // args.minibatch_size)
     num_iterations = max(1, args.total_timesteps // batch_size)

@@ -312,7 +312,7 @@ def test_clear_errors_of_what_the_scripts_share(tmp_path):
     for arguments, message in [
         ("--seed -1", "--seed must be at least 0"),
         ("--hidden-sizes 8 0", "--hidden-sizes must be at least 1"),
-        ("--gamma 1", "--gamma must lie in [0, 1)"),
+        ("--gamma 1.01", "--gamma and --gae-lambda must lie in [0, 1]"),
         ("--env-id nowhere:X-v0", "nowhere"),
         ("--horizon-growth 0", "--horizon-growth must be at least 1"),
         ("--env-id CartPole-v1", "no flat Box"),
