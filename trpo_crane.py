@@ -74,7 +74,7 @@ class Args:
     frame_skip: int = 20  # physics steps of 5 ms per decision
     contact: Literal["primitive", "sdf"] = "primitive"  # contact model of jaws and log
     reward: Literal["staged", "paper"] = "staged"  # staged, or as printed in the paper
-    omega2: float = 1.0  # sharpness of r_distance [1/m]
+    omega2: float = 1.0  # sharpness of r_distance and r_grapple [1/m]
     speed: Literal["real", "mjcf"] = "real"  # joint speed limits
     offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
     signed_yaw: bool = True  # observe the signed angle to the log, not the paper's Delta_psi
