@@ -25,6 +25,8 @@ from script_runs import (
     small,
 )
 
+import crane_env
+
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_gae_with_a_termination_and_a_truncation(algorithm):
@@ -296,10 +298,13 @@ def test_clear_errors(tmp_path, algorithm):
     torch.save({"algorithm": "other", "args": {}, "optimizer": {}}, tmp_path / "other.pt")
     old = {"algorithm": algorithm, "args": {"seed": 1}, "optimizer": {}}
     torch.save(old, tmp_path / "old.pt")
+    now = {**old, "args": vars(module(algorithm).Args()), "task": crane_env.REVISION - 1}
+    torch.save(now, tmp_path / "task.pt")
     for arguments, message in [
         ("--resume nowhere.pt", "--resume: no file nowhere.pt"),
         ("--resume other.pt", f"is no checkpoint.pt of {algorithm}"),
         ("--resume old.pt", "old.pt is of another revision"),
+        ("--resume task.pt", "task.pt is of another revision"),
         ("--num-envs 0", "--num-envs must be at least 1"),
         (ONE_SAMPLE[algorithm], "standard deviation"),
     ]:
