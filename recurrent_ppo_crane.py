@@ -83,6 +83,7 @@ class Args:
     # --- algorithm
     num_steps: int = 64  # decisions per crane and rollout
     hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
+    normalize_obs: bool = True  # scale observations by their running mean and deviation
     lstm_size: int = 64  # width of the memory that both read
     learning_rate: float = 7e-4  # Adam's step size
     anneal_lr: bool = True  # lower the step size linearly to 0
@@ -447,7 +448,8 @@ if __name__ == "__main__":
             first_state = state
             for step in range(args.num_steps):
                 with torch.no_grad():
-                    agent.update_normalizer(next_obs)
+                    if args.normalize_obs:
+                        agent.update_normalizer(next_obs)
                     # kept as the policy saw it, for the normaliser moves on
                     obs[step], starts[step] = agent.normalize(next_obs), next_start
                     features, state = agent.remember(obs[step][None], state, next_start[None])

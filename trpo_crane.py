@@ -87,6 +87,7 @@ class Args:
     # --- algorithm
     num_steps: int = 64  # decisions per crane and rollout
     hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
+    normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: float = 1e-3  # Adam's step size, for the critic
     anneal_lr: bool = True  # lower the step size linearly to 0
     gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
@@ -499,7 +500,8 @@ if __name__ == "__main__":
             cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
             for step in range(args.num_steps):
                 with torch.no_grad():
-                    agent.update_normalizer(next_obs)
+                    if args.normalize_obs:
+                        agent.update_normalizer(next_obs)
                     # kept as the policy saw it, for the normaliser moves on
                     obs[step] = agent.normalize(next_obs)
                     actions[step] = agent.get_distribution(obs[step]).sample()

@@ -1,9 +1,9 @@
 """Our scripts beside Stable-Baselines3 and sb3-contrib on tasks whose results are published.
 
-The same steps, networks, batch, epochs, step size, gamma, lambda and bounds on both
-sides, normalised observations, rewards by the same constant; final policies judged by the mean
-action in 20 episodes of the same seeds. Appends to benchmark/compare_sb3.csv and skips the rows it
-finds there.
+The same steps, networks, batch, epochs, step size, gamma, lambda and bounds on both sides,
+observations normalised on both or on neither, rewards by the same constant; final policies judged
+by the mean action in 20 episodes of the same seeds. Appends to benchmark/compare_sb3.csv and skips
+the rows it finds there.
 
     pip install -r benchmark/requirements.txt
     python benchmark/compare_sb3.py --help
@@ -13,7 +13,6 @@ import csv
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -25,7 +24,7 @@ import tyro
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "compare_sb3.csv"
-COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_return", "seconds"]
+COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_return"]
 EPISODES, EVAL_SEED = 20, 10_000
 
 
@@ -40,11 +39,12 @@ class Task:
     gamma: float
     learning_rate: float
     reward_scale: float
+    normalize_obs: bool
 
 
 TASKS = {
-    "Pendulum-v1": Task(102_400, 4, 1024, 64, 0.9, 1e-3, 0.1),
-    "HalfCheetah-v5": Task(100_352, 1, 2048, 64, 0.99, 3e-4, 0.1),
+    "Pendulum-v1": Task(102_400, 4, 1024, 64, 0.9, 1e-3, 0.1, False),
+    "HalfCheetah-v5": Task(100_352, 1, 2048, 64, 0.99, 3e-4, 0.1, True),
 }
 HIDDEN = (64, 64)
 EPOCHS, GAE_LAMBDA, CLIP = 10, 0.95, 0.2
@@ -101,6 +101,7 @@ def train_ours(task: str, algorithm: str, seed: int):
     flags["log-excess-init" if algorithm == "mppo_beta" else "log-std-init"] = 0.0
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
     words += ["--no-anneal-lr", "--hidden-sizes", *map(str, HIDDEN)]
+    words += [] if t.normalize_obs else ["--no-normalize-obs"]
     with tempfile.TemporaryDirectory() as folder:
         script = str(ROOT / f"{algorithm}_crane.py")
         command = [sys.executable, script, *words]
@@ -140,7 +141,7 @@ def train_sb3(task: str, algorithm: str, seed: int):
         wrapper_class=gymnasium.wrappers.TransformReward,
         wrapper_kwargs={"func": lambda reward: reward * t.reward_scale},
     )
-    envs = VecNormalize(envs, norm_reward=False, gamma=t.gamma)
+    envs = VecNormalize(envs, norm_obs=t.normalize_obs, norm_reward=False)
     common = dict(
         n_steps=t.num_steps,
         batch_size=t.minibatch_size,
@@ -179,12 +180,9 @@ if __name__ == "__main__":
                         continue
                     if (task, algorithm, library, seed, TASKS[task].steps) in done:
                         continue
-                    start = time.time()
-                    act = train(task, algorithm, seed)
-                    seconds = time.time() - start
-                    mean, std = judge(task, act)
+                    mean, std = judge(task, train(task, algorithm, seed))
                     row = [task, algorithm, library, seed, TASKS[task].steps]
-                    row += [round(mean, 1), round(std, 1), round(seconds, 1)]
+                    row += [round(mean, 1), round(std, 1)]
                     new = not RESULTS.exists()
                     with open(RESULTS, "a", newline="") as file:
                         writer = csv.writer(file)

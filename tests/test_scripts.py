@@ -201,10 +201,12 @@ def test_two_updates_on_the_crane_same_seed_same_weights(tmp_path, algorithm):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_any_box_task(tmp_path, algorithm):
-    arguments = "--env-id Pendulum-v1 --total-timesteps 128 --eval-every 1".split()
-    run(algorithm, tmp_path, *small(algorithm), *arguments)
+    arguments = "--env-id Pendulum-v1 --total-timesteps 128 --eval-every 1 --no-normalize-obs"
+    run(algorithm, tmp_path, *small(algorithm), *arguments.split())
     values = scalars(only_run(tmp_path))
     assert values["eval/episodic_return"][0] < 0 and "charts/success_rate" not in values
+    weights = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)["weights"]
+    assert (weights["obs_mean"] == 0).all() and (weights["obs_var"] == 1).all()
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
