@@ -125,10 +125,12 @@ class PlainCrane(gymnasium.Env):
 
         up = min(abs(uz), 1.0)
         clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        near = min(1.0, exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
-        centred = exp(-((miss / crane_env.CENTRED) ** 2))
-        grasp = 2 * near * centred
-        lift = exp(-d_combine) * centred * sqrt(min(max(clearance, 0.0), 1.0))
+        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
+        lift = (
+            exp(-d_combine)
+            * exp(-((miss / crane_env.CENTRED) ** 2))
+            * sqrt(min(max(clearance, 0.0), 1.0))
+        )
         reward = exp(-d_combine) + grasp * q[7] / crane_env.Q8_MAX + 2 * lift
         if touch[0] > 0 and touch[1] > 0:
             reward += 3 * (1 - tanh(hypot(*command[:5]))) * lift

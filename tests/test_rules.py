@@ -106,11 +106,12 @@ def test_staged_reward():
     r, grasp = np.exp(-0.8), 2 * 0.5 * np.exp(-0.3)  # q8 / 3 = 0.5; 0.05 m farther than 0.35 m
     # 0.125 m off the centre, half of 0.25 m; clearance 0.45 - 0.2 = 0.5^2
     centred, calm = np.exp(-0.25), 1 - np.tanh(0.5)
-    expected = [grasp * centred, 2 * 0.5 * r * centred, 3 * calm * 0.5 * r * centred]
-    np.testing.assert_allclose(terms, [[r, *expected]])
+    np.testing.assert_allclose(
+        terms, [[r, grasp, 2 * 0.5 * r * centred, 3 * calm * 0.5 * r * centred]]
+    )
     lifted["grapple_centre"] = [4.0, 7.0, 0.45]
     terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
-    np.testing.assert_allclose(terms, [[r, 0.0, 0.0, 0.0]], atol=1e-6)  # 1 m off the centre
+    np.testing.assert_allclose(terms, [[r, grasp, 0.0, 0.0]], atol=1e-6)
     one_jaw = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[True, False])
     terms = crane_env.reward_terms(one_jaw, np.array([0.4]), COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [[r, grasp, 2 * 0.5 * r, 0.0]])
