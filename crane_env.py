@@ -97,9 +97,7 @@ SERVOS = ["q1", "q2", "q3", "q4", "q4_stage2", "q7", "q8", "q8_inner"]
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
 ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
 LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
-TERMINATIONS = np.array(  # the first that applies counts
-    "none diverged joint_limit overspeed log_too_far not_reached time_limit".split()
-)
+TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reached", "time_limit"]
 Array = np.ndarray
 Step = tuple[Array, Array, Array, Array, dict[str, Any]]
 
@@ -275,22 +273,21 @@ def reward_terms(
 def termination_rule(
     state: CraneState, time: Array, reached: Array, diverged: Array, limits: Array, speed: Array
 ) -> Array:
-    """Index into TERMINATIONS of the rule that ends each episode, 0 where it goes on, (N,).
+    """The first of TERMINATIONS that ends each episode, "none" where it goes on, (N,).
 
     time (N,) in s since the start, reached (N,) bool, limits (8, 2) of the joints and speed (2, 6),
     as in SPEEDS, in rad, m and s.
     """
     q, (low, high) = state.q[:, LIMITED], limits[LIMITED].T
-    distance = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
-    rules = [
+    rules = [  # in the order of TERMINATIONS
         diverged,
         ((q < low) | (q > high)).any(axis=-1),
         ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
-        distance > LOG_RANGE,
+        np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1) > LOG_RANGE,
         ~reached & (time > REACH_TIME - 1e-9),
         time > TIME_LIMIT - 1e-9,
     ]
-    return np.select(rules, range(1, len(TERMINATIONS)), default=0)
+    return np.select(rules, TERMINATIONS, default="none")
 
 
 def success_conditions(
@@ -337,7 +334,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
 
     `info` describes the step just made, for every crane, also one that ended with it:
-    `termination` (a name of TERMINATIONS), the terms r_distance, r_grapple, r_lift, r_balance,
+    `termination` (of TERMINATIONS, or "none"), the terms r_distance, r_grapple, r_lift, r_balance,
     `d_combine`, `clearance`, `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful
     where an episode ended, `success` and its failed conditions `not_reached`, `not_lifted`,
     `not_held`, `off_centre`. Where episodes ended, `final_obs` and `final_info` hold their end
@@ -494,15 +491,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         slot = self._decisions % self._window.shape[1]
         self._window[np.arange(self.num_envs), slot] = now
 
-        rule = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
-        truncated = TERMINATIONS[rule] == "time_limit"
+        ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
+        truncated = ending == "time_limit"
+        terminated = (ending != "none") & ~truncated
         w = self._window
         conditions = success_conditions(reached, w[..., 0], w[..., 1:3] > 0, w[..., 3])
         conditions["success"] &= truncated
-        info |= conditions | {"termination": TERMINATIONS[rule], "time_to_reach": self._reach_time}
+        info |= conditions | {"termination": ending, "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
         reward = np.where(diverged, 0.0, reward)
-        return self._observe(state), reward, (rule > 0) & ~truncated, truncated, info
+        return self._observe(state), reward, terminated, truncated, info
 
     def _simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
