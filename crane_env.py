@@ -387,9 +387,23 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             self.fixed_diameter = np.broadcast_to(d, self.num_envs)
 
-        self.model = load_model(**model_options)
-        self.batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
-        self._bind(self.batch, self.model)
+        self.model = model = load_model(**model_options)
+        self.batch = batch = Batch(model, self.num_envs, env_threads, persistent=True)
+        # live views of the engine's arrays, and where in them our joints are
+        self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
+        self._ctrl, self._sensordata = map(batch.bind, ("ctrl", "sensordata"))
+        self._qfrc_bias = batch.bind("qfrc_bias")
+        for field in ("geom_size", "body_mass", "body_inertia"):
+            batch.expand(field)  # each crane has a log of its own
+        joints = [model.joint(name).id for name in JOINTS]
+        servos = [model.joint(name).id for name in SERVOS]
+        integrals = [model.actuator(f"{name}_integral").id for name in SERVOS]
+        self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
+        self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
+        self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
+        self._servo_kp = model.actuator_gainprm[integrals, 0]
+        self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
+
         self.dt = self.frame_skip * TIMESTEP
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
         window = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
@@ -412,24 +426,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._frame_size = (height, width)
         self._renderer = self._viewer = self._scene_model = self._scene_data = None
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
-
-    def _bind(self, batch: Batch, model: mujoco.MjModel) -> None:
-        """Live views of the engine's arrays, and where in them our joints are."""
-        self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
-        self._ctrl, self._sensordata = map(batch.bind, ("ctrl", "sensordata"))
-        self._qfrc_bias, self._geom_size = batch.bind("qfrc_bias"), batch.expand("geom_size")
-        self._body_mass, self._body_inertia = map(batch.expand, ("body_mass", "body_inertia"))
-        self._log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
-        self._log_body = model.body("log").id
-        self._log_qpos = slice(model.joint("log").qposadr[0], model.joint("log").qposadr[0] + 7)
-        joints = [model.joint(name).id for name in JOINTS]
-        servos = [model.joint(name).id for name in SERVOS]
-        self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
-        self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
-        self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
-        integrals = [model.actuator(f"{name}_integral").id for name in SERVOS]
-        self._servo_kp = model.actuator_gainprm[integrals, 0]
-        self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
 
     def reset(
         self, *, seed: int | Sequence[int | SeedSequence] | None = None, options: dict | None = None
@@ -537,22 +533,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self.batch.warning[ids] = 0
         radius = diameter / 2
         x, y, yaw = log_pose.T
         # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
-        self._qpos[ids, self._log_qpos] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
+        self.batch.joint("log").qpos[ids] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
         self._qpos[np.ix_(ids, self._q)] = q
         self._qpos[np.ix_(ids, self._servo_q)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
 
         mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
-        cylinder, capsule = self._log_geoms
-        self._geom_size[ids, cylinder, 0] = self._geom_size[ids, capsule, 0] = radius
-        self._geom_size[ids, capsule, 1] = LOG_LENGTH / 2 - radius
-        self._body_mass[ids, self._log_body] = mass
-        self._body_inertia[ids, self._log_body] = np.stack([across, across, along], axis=-1)
+        log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
+        self.batch.geom("log").size[ids, 0] = capsule.size[ids, 0] = radius
+        capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
+        log.mass[ids, 0] = mass
+        log.inertia[ids] = np.stack([across, across, along], axis=-1)
         self.batch.set_const(ids)  # bounding volumes and inverse weights follow
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
