@@ -341,8 +341,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     under the masks `_final_obs` and `_final_info`.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
-    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
+    metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
@@ -424,7 +423,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         self.render_mode, self.camera = render_mode, camera
         self._frame_size = (height, width)
-        self._renderer = self._viewer = self._scene_model = self._scene_data = None
+        self._renderer = self.viewer = self._scene = None
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
     def reset(
@@ -596,42 +595,35 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         }
 
     def render(self) -> tuple[Array, ...] | None:
-        """RGB frames (height, width, 3), one a crane; "human" shows crane 0 in a window."""
+        """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
+        if self._scene is None:
+            self._scene = self.batch.get_model(0), self.batch.get_data(0)  # the window keeps them
+        model, data = self._scene
         if self.render_mode == "rgb_array":
-            return tuple(self.render_crane(i) for i in range(self.num_envs))
+            if self._renderer is None:
+                self._renderer = mujoco.Renderer(model, *self._frame_size)
+            frames = []
+            for i in range(self.num_envs):
+                self.batch.get_model(i, model)
+                self.batch.get_data(i, data)
+                self._renderer.update_scene(data, self.camera)
+                frames.append(self._renderer.render())
+            return tuple(frames)
         if self.render_mode == "human":
-            import mujoco.viewer  # needs a display's libraries
+            from mujoco import viewer  # needs a display's libraries
 
-            if self._viewer is None:
-                self._viewer = mujoco.viewer.launch_passive(*self._scene(0))
-            with self._viewer.lock():
-                self._scene(0)
-            self._viewer.sync()
-
-    def _scene(self, i: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Copies of crane i's model and data, always into the same two objects."""
-        self._scene_model = self.batch.get_model(i, self._scene_model)
-        self._scene_data = self.batch.get_data(i, self._scene_data)
-        return self._scene_model, self._scene_data
-
-    def render_crane(self, i: int, camera: str | None = None) -> Array:
-        """RGB frame (height, width, 3), uint8, of crane i; cameras: overview, side, grapple."""
-        model, data = self._scene(i)
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(model, *self._frame_size)
-        self._renderer.update_scene(data, camera or self.camera)
-        return self._renderer.render()
-
-    @property
-    def window_closed(self) -> bool:
-        """Whether the user has closed the "human" window."""
-        return self._viewer is not None and not self._viewer.is_running()
+            if self.viewer is None:
+                self.viewer = viewer.launch_passive(model, data)
+            with self.viewer.lock():
+                self.batch.get_model(0, model)
+                self.batch.get_data(0, data)
+            self.viewer.sync()
 
     def close_extras(self, **kwargs: Any) -> None:
-        for window in (self._renderer, self._viewer):
+        for window in (self._renderer, self.viewer):
             if window is not None:
                 window.close()
-        self._renderer = self._viewer = None
+        self._renderer = self.viewer = None
 
 
 class CraneEnv(gymnasium.Env):
