@@ -99,7 +99,6 @@ ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
 LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
 TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reached", "time_limit"]
 Array = np.ndarray
-Step = tuple[Array, Array, Array, Array, dict[str, Any]]
 
 
 class CraneState(NamedTuple):
@@ -185,13 +184,11 @@ def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array,
     q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
     q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
 
-    easy_radius, easy_yaw = np.clip(out, 5.5, 7.5), q1 - q7
-    radius = easy_radius + difficulty * (radius - easy_radius)
-    azimuth = q1 + difficulty * (azimuth - q1)
-    turn = (yaw - easy_yaw + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
-    yaw = (easy_yaw + difficulty * turn + np.pi / 2) % np.pi - np.pi / 2
-    mean_diameter = (D_MIN + D_MAX) / 2
-    diameter = mean_diameter + difficulty * (diameter - mean_diameter)
+    easiest = np.array([np.clip(out, 5.5, 7.5), q1, q1 - q7, (D_MIN + D_MAX) / 2])
+    way = np.array([radius, azimuth, yaw, diameter]) - easiest
+    way[2] = (way[2] + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
+    radius, azimuth, yaw, diameter = easiest + difficulty * way
+    yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
     return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
 
@@ -429,16 +426,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | SeedSequence] | None = None, options: dict | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start a new episode in every crane.
-
-        seed: one for all (crane i then draws from its i-th child), or one per crane.
-        """
+        """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self._rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
-                seeds = SeedSequence(seed).spawn(self.num_envs)
-            else:
-                seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
+                seed = SeedSequence(seed).spawn(self.num_envs)
+            seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
             # starts and pose noise have streams of their own: noise leaves the starts as they are
@@ -447,22 +440,22 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         state = self._state()
         return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
 
-    def step(self, actions: Array) -> Step:
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
         if done.any():
             ended = np.flatnonzero(done)
+            info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for i in ended:
                 info["final_obs"][i] = obs[i].copy()
-            info["final_info"] = {k: v for k, v in info.items() if k != "final_obs"}
             info["_final_obs"] = info["_final_info"] = done
             self._start_episodes(ended)
             obs[ended] = self._observe(self._state())[ended]
         return obs, reward, terminated, truncated, info
 
-    def advance(self, actions: Array) -> Step:
+    def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """`step` without autoreset: an ended episode stays where it ended."""
         if self._rngs is None:
             raise RuntimeError("call reset() before step()")
@@ -516,14 +509,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return failed | warned | ~finite
 
     def _start_episodes(self, ids: Array) -> None:
-        """Draw new starts for the cranes `ids`."""
         starts = []
         for i in ids:
             start_rng, noise_rng = self._rngs[i]
             starts.append(sample_start(start_rng, self.difficulty))
-            draws = (1 if self.pose_noise == "episode" else self.max_decisions + 1, 2)
             if self.pose_noise != "none":
-                self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=draws)
+                draws = 1 if self.pose_noise == "episode" else self.max_decisions + 1
+                self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=(draws, 2))
         q, log_pose, diameter = (np.array(column) for column in zip(*starts))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
@@ -638,9 +630,7 @@ class CraneEnv(gymnasium.Env):
         self.observation_space = self.envs.single_observation_space
         self.action_space = self.envs.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
         if self.render_mode == "human":
@@ -663,7 +653,5 @@ class CraneEnv(gymnasium.Env):
 
 
 gymnasium.register(
-    "ForestryCrane-v0",
-    entry_point="crane_env:CraneEnv",
-    vector_entry_point="crane_env:CraneVectorEnv",
+    "ForestryCrane-v0", "crane_env:CraneEnv", vector_entry_point="crane_env:CraneVectorEnv"
 )
