@@ -97,11 +97,8 @@ SERVOS = ["q1", "q2", "q3", "q4", "q4_stage2", "q7", "q8", "q8_inner"]
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
 ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
 LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
-TERMINATIONS = np.array(  # the first that applies counts
-    "none diverged joint_limit overspeed log_too_far not_reached time_limit".split()
-)
+TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reached", "time_limit"]
 Array = np.ndarray
-Step = tuple[Array, Array, Array, Array, dict[str, Any]]
 
 
 class CraneState(NamedTuple):
@@ -187,13 +184,11 @@ def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array,
     q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
     q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
 
-    easy_radius, easy_yaw = np.clip(out, 5.5, 7.5), q1 - q7
-    radius = easy_radius + difficulty * (radius - easy_radius)
-    azimuth = q1 + difficulty * (azimuth - q1)
-    turn = (yaw - easy_yaw + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
-    yaw = (easy_yaw + difficulty * turn + np.pi / 2) % np.pi - np.pi / 2
-    mean_diameter = (D_MIN + D_MAX) / 2
-    diameter = mean_diameter + difficulty * (diameter - mean_diameter)
+    easiest = np.array([np.clip(out, 5.5, 7.5), q1, q1 - q7, (D_MIN + D_MAX) / 2])
+    way = np.array([radius, azimuth, yaw, diameter]) - easiest
+    way[2] = (way[2] + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
+    radius, azimuth, yaw, diameter = easiest + difficulty * way
+    yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
     return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
 
@@ -275,22 +270,21 @@ def reward_terms(
 def termination_rule(
     state: CraneState, time: Array, reached: Array, diverged: Array, limits: Array, speed: Array
 ) -> Array:
-    """Index into TERMINATIONS of the rule that ends each episode, 0 where it goes on, (N,).
+    """The first of TERMINATIONS that ends each episode, "none" where it goes on, (N,).
 
     time (N,) in s since the start, reached (N,) bool, limits (8, 2) of the joints and speed (2, 6),
     as in SPEEDS, in rad, m and s.
     """
     q, (low, high) = state.q[:, LIMITED], limits[LIMITED].T
-    distance = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
-    rules = [
+    rules = [  # in the order of TERMINATIONS
         diverged,
         ((q < low) | (q > high)).any(axis=-1),
         ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
-        distance > LOG_RANGE,
+        np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1) > LOG_RANGE,
         ~reached & (time > REACH_TIME - 1e-9),
         time > TIME_LIMIT - 1e-9,
     ]
-    return np.select(rules, range(1, len(TERMINATIONS)), default=0)
+    return np.select(rules, TERMINATIONS, default="none")
 
 
 def success_conditions(
@@ -337,15 +331,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
 
     `info` describes the step just made, for every crane, also one that ended with it:
-    `termination` (a name of TERMINATIONS), the terms r_distance, r_grapple, r_lift, r_balance,
+    `termination` (of TERMINATIONS, or "none"), the terms r_distance, r_grapple, r_lift, r_balance,
     `d_combine`, `clearance`, `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful
     where an episode ended, `success` and its failed conditions `not_reached`, `not_lifted`,
     `not_held`, `off_centre`. Where episodes ended, `final_obs` and `final_info` hold their end
     under the masks `_final_obs` and `_final_info`.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
-    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
+    metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
@@ -390,9 +383,23 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             self.fixed_diameter = np.broadcast_to(d, self.num_envs)
 
-        self.model = load_model(**model_options)
-        self.batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
-        self._bind(self.batch, self.model)
+        self.model = model = load_model(**model_options)
+        self.batch = batch = Batch(model, self.num_envs, env_threads, persistent=True)
+        # live views of the engine's arrays, and where in them our joints are
+        self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
+        self._ctrl, self._sensordata = map(batch.bind, ("ctrl", "sensordata"))
+        self._qfrc_bias = batch.bind("qfrc_bias")
+        for field in ("geom_size", "body_mass", "body_inertia"):
+            batch.expand(field)  # each crane has a log of its own
+        joints = [model.joint(name).id for name in JOINTS]
+        servos = [model.joint(name).id for name in SERVOS]
+        integrals = [model.actuator(f"{name}_integral").id for name in SERVOS]
+        self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
+        self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
+        self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
+        self._servo_kp = model.actuator_gainprm[integrals, 0]
+        self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
+
         self.dt = self.frame_skip * TIMESTEP
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
         window = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
@@ -413,40 +420,18 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         self.render_mode, self.camera = render_mode, camera
         self._frame_size = (height, width)
-        self._renderer = self._viewer = self._scene_model = self._scene_data = None
+        self._renderer = self.viewer = self._scene = None
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
-
-    def _bind(self, batch: Batch, model: mujoco.MjModel) -> None:
-        """Live views of the engine's arrays, and where in them our joints are."""
-        self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
-        self._ctrl, self._sensordata = map(batch.bind, ("ctrl", "sensordata"))
-        self._qfrc_bias, self._geom_size = batch.bind("qfrc_bias"), batch.expand("geom_size")
-        self._body_mass, self._body_inertia = map(batch.expand, ("body_mass", "body_inertia"))
-        self._log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
-        self._log_body = model.body("log").id
-        self._log_qpos = slice(model.joint("log").qposadr[0], model.joint("log").qposadr[0] + 7)
-        joints = [model.joint(name).id for name in JOINTS]
-        servos = [model.joint(name).id for name in SERVOS]
-        self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
-        self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
-        self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
-        integrals = [model.actuator(f"{name}_integral").id for name in SERVOS]
-        self._servo_kp = model.actuator_gainprm[integrals, 0]
-        self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
 
     def reset(
         self, *, seed: int | Sequence[int | SeedSequence] | None = None, options: dict | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start a new episode in every crane.
-
-        seed: one for all (crane i then draws from its i-th child), or one per crane.
-        """
+        """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self._rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
-                seeds = SeedSequence(seed).spawn(self.num_envs)
-            else:
-                seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
+                seed = SeedSequence(seed).spawn(self.num_envs)
+            seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
             # starts and pose noise have streams of their own: noise leaves the starts as they are
@@ -455,22 +440,22 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         state = self._state()
         return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
 
-    def step(self, actions: Array) -> Step:
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
         if done.any():
             ended = np.flatnonzero(done)
+            info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for i in ended:
                 info["final_obs"][i] = obs[i].copy()
-            info["final_info"] = {k: v for k, v in info.items() if k != "final_obs"}
             info["_final_obs"] = info["_final_info"] = done
             self._start_episodes(ended)
             obs[ended] = self._observe(self._state())[ended]
         return obs, reward, terminated, truncated, info
 
-    def advance(self, actions: Array) -> Step:
+    def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """`step` without autoreset: an ended episode stays where it ended."""
         if self._rngs is None:
             raise RuntimeError("call reset() before step()")
@@ -494,15 +479,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         slot = self._decisions % self._window.shape[1]
         self._window[np.arange(self.num_envs), slot] = now
 
-        rule = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
-        truncated = TERMINATIONS[rule] == "time_limit"
+        ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
+        truncated = ending == "time_limit"
+        terminated = (ending != "none") & ~truncated
         w = self._window
         conditions = success_conditions(reached, w[..., 0], w[..., 1:3] > 0, w[..., 3])
         conditions["success"] &= truncated
-        info |= conditions | {"termination": TERMINATIONS[rule], "time_to_reach": self._reach_time}
+        info |= conditions | {"termination": ending, "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
         reward = np.where(diverged, 0.0, reward)
-        return self._observe(state), reward, (rule > 0) & ~truncated, truncated, info
+        return self._observe(state), reward, terminated, truncated, info
 
     def _simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
@@ -523,14 +509,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return failed | warned | ~finite
 
     def _start_episodes(self, ids: Array) -> None:
-        """Draw new starts for the cranes `ids`."""
         starts = []
         for i in ids:
             start_rng, noise_rng = self._rngs[i]
             starts.append(sample_start(start_rng, self.difficulty))
-            draws = (1 if self.pose_noise == "episode" else self.max_decisions + 1, 2)
             if self.pose_noise != "none":
-                self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=draws)
+                draws = 1 if self.pose_noise == "episode" else self.max_decisions + 1
+                self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=(draws, 2))
         q, log_pose, diameter = (np.array(column) for column in zip(*starts))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
@@ -539,22 +524,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self.batch.warning[ids] = 0
         radius = diameter / 2
         x, y, yaw = log_pose.T
         # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
-        self._qpos[ids, self._log_qpos] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
+        self.batch.joint("log").qpos[ids] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
         self._qpos[np.ix_(ids, self._q)] = q
         self._qpos[np.ix_(ids, self._servo_q)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
 
         mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
-        cylinder, capsule = self._log_geoms
-        self._geom_size[ids, cylinder, 0] = self._geom_size[ids, capsule, 0] = radius
-        self._geom_size[ids, capsule, 1] = LOG_LENGTH / 2 - radius
-        self._body_mass[ids, self._log_body] = mass
-        self._body_inertia[ids, self._log_body] = np.stack([across, across, along], axis=-1)
+        log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
+        self.batch.geom("log").size[ids, 0] = capsule.size[ids, 0] = radius
+        capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
+        log.mass[ids, 0] = mass
+        log.inertia[ids] = np.stack([across, across, along], axis=-1)
         self.batch.set_const(ids)  # bounding volumes and inverse weights follow
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -603,42 +587,35 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         }
 
     def render(self) -> tuple[Array, ...] | None:
-        """RGB frames (height, width, 3), one a crane; "human" shows crane 0 in a window."""
+        """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
+        if self._scene is None:
+            self._scene = self.batch.get_model(0), self.batch.get_data(0)  # the window keeps them
+        model, data = self._scene
         if self.render_mode == "rgb_array":
-            return tuple(self.render_crane(i) for i in range(self.num_envs))
+            if self._renderer is None:
+                self._renderer = mujoco.Renderer(model, *self._frame_size)
+            frames = []
+            for i in range(self.num_envs):
+                self.batch.get_model(i, model)
+                self.batch.get_data(i, data)
+                self._renderer.update_scene(data, self.camera)
+                frames.append(self._renderer.render())
+            return tuple(frames)
         if self.render_mode == "human":
-            import mujoco.viewer  # needs a display's libraries
+            from mujoco import viewer  # needs a display's libraries
 
-            if self._viewer is None:
-                self._viewer = mujoco.viewer.launch_passive(*self._scene(0))
-            with self._viewer.lock():
-                self._scene(0)
-            self._viewer.sync()
-
-    def _scene(self, i: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Copies of crane i's model and data, always into the same two objects."""
-        self._scene_model = self.batch.get_model(i, self._scene_model)
-        self._scene_data = self.batch.get_data(i, self._scene_data)
-        return self._scene_model, self._scene_data
-
-    def render_crane(self, i: int, camera: str | None = None) -> Array:
-        """RGB frame (height, width, 3), uint8, of crane i; cameras: overview, side, grapple."""
-        model, data = self._scene(i)
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(model, *self._frame_size)
-        self._renderer.update_scene(data, camera or self.camera)
-        return self._renderer.render()
-
-    @property
-    def window_closed(self) -> bool:
-        """Whether the user has closed the "human" window."""
-        return self._viewer is not None and not self._viewer.is_running()
+            if self.viewer is None:
+                self.viewer = viewer.launch_passive(model, data)
+            with self.viewer.lock():
+                self.batch.get_model(0, model)
+                self.batch.get_data(0, data)
+            self.viewer.sync()
 
     def close_extras(self, **kwargs: Any) -> None:
-        for window in (self._renderer, self._viewer):
+        for window in (self._renderer, self.viewer):
             if window is not None:
                 window.close()
-        self._renderer = self._viewer = None
+        self._renderer = self.viewer = None
 
 
 class CraneEnv(gymnasium.Env):
@@ -653,9 +630,7 @@ class CraneEnv(gymnasium.Env):
         self.observation_space = self.envs.single_observation_space
         self.action_space = self.envs.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
         if self.render_mode == "human":
@@ -678,7 +653,5 @@ class CraneEnv(gymnasium.Env):
 
 
 gymnasium.register(
-    "ForestryCrane-v0",
-    entry_point="crane_env:CraneEnv",
-    vector_entry_point="crane_env:CraneVectorEnv",
+    "ForestryCrane-v0", "crane_env:CraneEnv", vector_entry_point="crane_env:CraneVectorEnv"
 )

@@ -245,13 +245,14 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     fps = round(1 / (frame_every * dt))
     gif = args.video.suffix == ".gif"
     options = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
-    size = {"width": args.width, "height": args.width * 9 // 32 * 2}
+    view = {"width": args.width, "height": args.width * 9 // 32 * 2, "camera": args.camera}
+    kwargs |= view | {"render_mode": "rgb_array"}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
     try:
         with imageio.get_writer(unfinished, **options) as video:
             for diameter, seed in zip(tqdm(diameters, desc="trials filmed"), seeds):
-                envs = CraneVectorEnv(1, skip // substeps, diameter=diameter, **size, **kwargs)
+                envs = CraneVectorEnv(1, skip // substeps, diameter=diameter, **kwargs)
                 obs, _ = envs.reset(seed=[seed])
                 act, ended, step = make_act(), False, 0
                 while not ended:
@@ -259,7 +260,7 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
                         actions = act(obs)
                     obs, _, terminated, truncated, _ = envs.advance(actions)
                     if step % frame_every == 0:
-                        video.append_data(envs.render_crane(0, args.camera))
+                        video.append_data(envs.render()[0])
                     ended, step = terminated[0] or truncated[0], step + 1
                 envs.close()
         os.replace(unfinished, args.video)
@@ -274,7 +275,7 @@ def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     try:
         obs, _ = envs.reset(seed=args.seed)
         act = make_act()
-        while not envs.window_closed:
+        while envs.viewer is None or envs.viewer.is_running():
             start = time.time()
             obs, _, terminated, truncated, info = envs.step(act(obs))
             envs.render()

@@ -569,7 +569,7 @@ if __name__ == "__main__":
                 report |= {f"reward/{name[2:]}": value for name, value in terms.items()}
                 if ended["return"]:
                     report["charts/success_rate"] = np.mean(recent_success)
-                    for name in crane_env.TERMINATIONS[1:]:
+                    for name in crane_env.TERMINATIONS:
                         share = np.mean(np.array(ended["termination"]) == name)
                         report[f"termination/{name}"] = share
                     full = len(recent_success) == recent_success.maxlen
