@@ -238,21 +238,22 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
 
 def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     """One trial per diameter. At 10 decisions a second, a frame is also taken between decisions."""
-    skip = kwargs.pop("frame_skip", 20)
+    skip = kwargs.get("frame_skip", 20)
     substeps = 2 if skip % 20 == 0 else 1
     frame_every = max(1, round(10 / (skip // substeps)))
     dt = skip // substeps * crane_env.TIMESTEP
     fps = round(1 / (frame_every * dt))
     gif = args.video.suffix == ".gif"
     options = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
-    view = {"width": args.width, "height": args.width * 9 // 32 * 2, "camera": args.camera}
-    kwargs |= view | {"render_mode": "rgb_array"}
+    size = {"width": args.width, "height": args.width * 9 // 32 * 2}
+    kwargs = kwargs | size | {"render_mode": "rgb_array", "camera": args.camera}
+    kwargs["frame_skip"] = skip // substeps
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
     try:
         with imageio.get_writer(unfinished, **options) as video:
             for diameter, seed in zip(tqdm(diameters, desc="trials filmed"), seeds):
-                envs = CraneVectorEnv(1, skip // substeps, diameter=diameter, **kwargs)
+                envs = CraneVectorEnv(1, diameter=diameter, **kwargs)
                 obs, _ = envs.reset(seed=[seed])
                 act, ended, step = make_act(), False, 0
                 while not ended:
