@@ -92,7 +92,10 @@ def train_ours(task: str, algorithm: str, seed: int):
         "final-trials": 0,
     }
     if algorithm == "trpo":
-        flags |= {"max-kl": MAX_KL, "cg-damping": CG_DAMPING, "cg-iterations": CG_ITERATIONS}
+        # sb3-contrib means the KL divergence over the action's components, ours sums it
+        components = gymnasium.make(task).action_space.shape[0]
+        flags |= {"max-kl": MAX_KL * components, "cg-damping": CG_DAMPING * components}
+        flags["cg-iterations"] = CG_ITERATIONS
     else:
         flags |= {"clip-coef": CLIP, "target-kl": None}
     # no schedules but mPPO's fading perturbation; Gaussians as wide at the start as SB3's, the Beta
