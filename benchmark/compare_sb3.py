@@ -1,9 +1,10 @@
-"""Our scripts beside Stable-Baselines3 and sb3-contrib on tasks whose results are published.
+"""Our scripts beside Stable-Baselines3 and sb3-contrib on two well-known tasks.
 
 The same steps, networks, batch, epochs, step size, gamma, lambda and bounds on both sides,
 observations normalised on both or on neither, rewards by the same constant; final policies judged
 by the mean action in 20 episodes of the same seeds. Appends to benchmark/compare_sb3.csv and skips
-the rows it finds there.
+the rows it finds there: remove those of other settings first. Prints mean and standard deviation
+over the seeds.
 
     pip install -r benchmark/requirements.txt
     python benchmark/compare_sb3.py --help
@@ -13,6 +14,7 @@ import csv
 import subprocess
 import sys
 import tempfile
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,13 +26,17 @@ import tyro
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "compare_sb3.csv"
-COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_return"]
+COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_over_episodes"]
 EPISODES, EVAL_SEED = 20, 10_000
 
 
 @dataclass(frozen=True)
 class Task:
-    """Hyperparameters of rl-baselines3-zoo (Pendulum) and CleanRL's ppo_continuous_action."""
+    """Close to rl-baselines3-zoo (Pendulum, without gSDE) and CleanRL (HalfCheetah).
+
+    Without CleanRL's annealing, value clipping and running reward normalisation; TRPO by
+    sb3-contrib's defaults but for the batch of its critic.
+    """
 
     steps: int  # whole rollouts
     num_envs: int
@@ -95,7 +101,7 @@ def train_ours(task: str, algorithm: str, seed: int):
         # sb3-contrib means the KL divergence over the action's components, ours sums it
         components = gymnasium.make(task).action_space.shape[0]
         flags |= {"max-kl": MAX_KL * components, "cg-damping": CG_DAMPING * components}
-        flags["cg-iterations"] = CG_ITERATIONS
+        flags |= {"cg-iterations": CG_ITERATIONS, "max-grad-norm": "inf"}
     else:
         flags |= {"clip-coef": CLIP, "target-kl": None}
     # no schedules but mPPO's fading perturbation; Gaussians as wide at the start as SB3's, the Beta
@@ -191,3 +197,11 @@ if __name__ == "__main__":
                         writer = csv.writer(file)
                         writer.writerows([COLUMNS, row] if new else [row])
                     print(*row, flush=True)
+
+    results = defaultdict(list)
+    for row in csv.DictReader(open(RESULTS)):
+        cell = row["task"], row["algorithm"], row["library"]
+        results[cell].append(float(row["mean_return"]))
+    for cell, returns in sorted(results.items()):
+        spread = np.std(returns, ddof=1) if len(returns) > 1 else np.nan
+        print(*cell, f"{np.mean(returns):.0f} +- {spread:.0f} over {len(returns)} seeds")

@@ -112,16 +112,17 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
         envs = DummyVecEnv(makers) if kind == "Dummy" else CranesForSB3(frame_skip)
     policy = {"net_arch": list(NETWORK), "log_std_init": LOG_STD}
     options = {"n_steps": rollout // n, "batch_size": rollout // MINIBATCHES, "device": "cpu"}
-    options |= {"n_epochs": EPOCHS, "policy_kwargs": policy}
+    options |= {"n_epochs": EPOCHS, "policy_kwargs": policy, "seed": SEED}
     maker, network = stable_baselines3.PPO, "MlpPolicy"
     if algorithm == "collect":
         maker = CollectOnly
     elif algorithm == "defaults":
-        options = {"n_steps": rollout, "device": "cpu"}
-    elif algorithm == "TRPO":  # the step as in trpo_crane.py, the critic as above
+        options = {"n_steps": rollout, "device": "cpu", "seed": SEED}
+    elif algorithm == "TRPO":  # trpo_crane.py's step (it sums the KL over 6 components, SB3 means)
         maker = sb3_contrib.TRPO
-        options |= {"n_critic_updates": options.pop("n_epochs"), "target_kl": 0.02}
-    elif algorithm == "RecurrentPPO":  # one memory that actor and critic read, as ours
+        options |= {"n_critic_updates": options.pop("n_epochs")}
+        options |= {"target_kl": 0.02 / 6, "cg_damping": 0.1 / 6}
+    elif algorithm == "RecurrentPPO":  # one memory, as ours; its networks do not see obs beside it
         maker, network = sb3_contrib.RecurrentPPO, "MlpLstmPolicy"
         policy |= {"lstm_hidden_size": LSTM, "shared_lstm": True, "enable_critic_lstm": False}
     stopwatch = Stopwatch()
