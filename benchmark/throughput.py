@@ -15,8 +15,8 @@ Last come the ratios that matter, each with a bar to pass and an aim.
 - memory: resident memory of CraneVectorEnv per crane.
 - training: iterations of our scripts and of SB3, from the second on, with the same network,
   rollout, epochs and minibatch. SB3 has its fastest arrangement of environments, RecurrentPPO also
-  64 at once, the better of 1 and 2 threads, no monitor and no normalised observations; ours have
-  their defaults. It is the start of a training: no crane holds a log yet. "update" is what follows
+  64 at once, the better of 1 and 2 threads, no monitor and no normalised observations; ours have 2
+  threads and else their defaults. It is the start of a training: no crane holds a log yet. "update" is what follows
   the rollout; ours contains values, log-probabilities and advantages, which SB3 computes before.
 """
 
@@ -264,7 +264,7 @@ def resident_mb(num_envs: int) -> float:
 def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, float]:
     """Iterations 2 to 4 of one of our scripts, and its peak memory in MB."""
     rollout = CRANES * num_steps
-    flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": 1}
+    flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": THREADS}
     flags |= {"frame-skip": frame_skip, "num-steps": num_steps, "update-epochs": EPOCHS}
     flags |= {"total-timesteps": 4 * rollout, "eval-every": 0, "final-trials": 0}
     if script == "recurrent_ppo":
@@ -290,7 +290,8 @@ def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, 
         events = EventAccumulator(str(run)).Reload()
     updates = events.Scalars("time/update")
     seconds = np.diff([event.wall_time for event in updates])
-    return Training((rollout / seconds).tolist(), [event.value for event in updates[1:]]), peak
+    values = [event.value for event in updates[1:]]
+    return Training((rollout / seconds).tolist(), values, THREADS), peak
 
 
 def measure_training(results: Results, num_steps: int, bar: tqdm) -> None:
@@ -305,8 +306,9 @@ def measure_training(results: Results, num_steps: int, bar: tqdm) -> None:
     for skip in (20, 1):
         for script in SCRIPTS:
             bar.set_description(script)
+            training, peak = train_ours(script, skip, num_steps)
             note = f"{CRANES} cranes, physics threads {THREADS}"
-            add(f"{script}_crane.py", skip, *train_ours(script, skip, num_steps), note)
+            add(f"{script}_crane.py", skip, training, peak, note)
         bar.set_description("SB3's arrangements")
         trials, _ = in_child(sb3.try_arrangements, skip, rollout // 4)
         for (kind, n), trial in zip(sb3.ARRANGEMENTS, trials):
