@@ -16,8 +16,9 @@ Last come the ratios that matter, each with a bar to pass and an aim.
 - training: iterations of our scripts and of SB3, from the second on, with the same network,
   rollout, epochs and minibatch. SB3 has its fastest arrangement of environments, RecurrentPPO also
   64 at once, the better of 1 and 2 threads, no monitor and no normalised observations; ours have 2
-  threads and else their defaults. It is the start of a training: no crane holds a log yet. "update" is what follows
-  the rollout; ours contains values, log-probabilities and advantages, which SB3 computes before.
+  threads and else their defaults. It is the start of a training: no crane holds a log yet. "update"
+  is what follows the rollout; ours contains values, log-probabilities and advantages, which SB3
+  computes before.
 """
 
 import csv
