@@ -97,7 +97,7 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
     module = ALGORITHMS[algorithm]
     known = {field.name for field in fields(module.Args)}
-    if saved.get("task") != crane_env.REVISION or args.keys() != known:
+    if saved.get("task") != crane_env.REVISION or not args.keys() <= known:
         print(
             f"{path} is of another revision of this repository; judged by today's", file=sys.stderr
         )

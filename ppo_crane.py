@@ -343,6 +343,8 @@ if __name__ == "__main__":
         agent.load_state_dict(checkpoint["weights"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         first_iteration = checkpoint["iteration"] + 1
+        if first_iteration > num_iterations:
+            print("all updates of this run are done: only its final evaluation is made again")
         difficulty = checkpoint["difficulty"]
         run_dir = Path(args.resume).parent
     else:

@@ -68,6 +68,13 @@ def test_both_tables_unless_noise_is_given():
     assert one.stdout.count("| mean") == 1
 
 
+@pytest.mark.parametrize("algorithm", eval_crane.ALGORITHMS)
+def test_shipped_policies_are_of_this_revision(algorithm, capsys):
+    path = eval_crane.SHIPPED.with_name(f"{algorithm}_crane.pt")
+    assert eval_crane.load_policy(path, stochastic=False)[2] == algorithm
+    assert capsys.readouterr().err == ""
+
+
 def test_shipped_policy_lifts_logs():
     result = run("--json", "--trials", "4", "--diameters", "0.4", "0.6", "--seed", "77")
     assert result.returncode == 0, result.stderr

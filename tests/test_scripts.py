@@ -259,6 +259,8 @@ def test_killed_run_goes_on(tmp_path, algorithm):
     before = torch.load(run_dir / "checkpoint.pt", weights_only=True)
     assert 10 <= before["iteration"] < 50
     run(algorithm, tmp_path, "--resume", str(run_dir / "checkpoint.pt"))
+    again = run(algorithm, tmp_path, "--resume", str(run_dir / "checkpoint.pt"))
+    assert "all updates of this run are done" in again.stdout
     after = torch.load(run_dir / "checkpoint.pt", weights_only=True)
     assert after["iteration"] == 50 and only_run(tmp_path) == run_dir
     steps = [s["step"].item() for s in after["optimizer"]["state"].values()]
