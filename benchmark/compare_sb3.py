@@ -98,7 +98,7 @@ def train_ours(task: str, algorithm: str, seed: int):
         "final-trials": 0,
     }
     if algorithm == "trpo":
-        # sb3-contrib means the KL divergence over the action's components, ours sums it
+        # sb3-contrib averages the KL divergence over the action's components, ours sums it
         components = gymnasium.make(task).action_space.shape[0]
         flags |= {"max-kl": MAX_KL * components, "cg-damping": CG_DAMPING * components}
         flags |= {"cg-iterations": CG_ITERATIONS, "max-grad-norm": "inf"}

@@ -118,7 +118,7 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
         maker = CollectOnly
     elif algorithm == "defaults":
         options = {"n_steps": rollout, "device": "cpu", "seed": SEED}
-    elif algorithm == "TRPO":  # trpo_crane.py's step (it sums the KL over 6 components, SB3 means)
+    elif algorithm == "TRPO":  # trpo_crane.py's step (it sums the KL over 6 components, SB3 averages)
         maker = sb3_contrib.TRPO
         options |= {"n_critic_updates": options.pop("n_epochs")}
         options |= {"target_kl": 0.02 / 6, "cg_damping": 0.1 / 6}
