@@ -118,9 +118,10 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
         maker = CollectOnly
     elif algorithm == "defaults":
         options = {"n_steps": rollout, "device": "cpu", "seed": SEED}
-    elif algorithm == "TRPO":  # trpo_crane.py's step (it sums the KL over 6 components, SB3 averages)
+    elif algorithm == "TRPO":  # the step as in trpo_crane.py, the critic as above
         maker = sb3_contrib.TRPO
         options |= {"n_critic_updates": options.pop("n_epochs")}
+        # SB3 averages the KL divergence over the action's 6 components, ours sums it
         options |= {"target_kl": 0.02 / 6, "cg_damping": 0.1 / 6}
     elif algorithm == "RecurrentPPO":  # one memory, as ours; its networks do not see obs beside it
         maker, network = sb3_contrib.RecurrentPPO, "MlpLstmPolicy"
