@@ -66,7 +66,7 @@ from mujoco.batch import Batch, SimulationError
 from numpy.random import Generator, SeedSequence, default_rng
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
-REVISION = 4  # of the task; raise it when a change spoils policies or checkpoints
+REVISION = 5  # of the task; raise it when a change spoils policies or checkpoints
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators
 LOG_LENGTH = 2.75  # m
@@ -240,14 +240,13 @@ def reward_terms(
     command: Array,
     kind: str = "staged",
     omega2: float = 1.0,
-    omega3: float = 1.0,
 ) -> Array:
     """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
 
-    d_combine (N,) is ||Delta_p|| + omega1 Delta_psi in m, command (N, 6) the commanded velocities
-    in rad/s and m/s. kind "paper" is Sec. III-A2 as printed. In "staged" r_grapple and r_lift
-    count only near the log and its centre, r_balance only while it is lifted and both jaws touch
-    it, whatever is commanded to them. Why: README, errata.
+    d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, command (N, 6) the commanded velocities in
+    rad/s and m/s. kind "paper" is Sec. III-A2 as printed. In "staged" r_grapple and r_lift count
+    only near the log's centre, r_balance only while it is lifted and both jaws touch it, whatever
+    is commanded to them. Why: README, errata.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -255,12 +254,14 @@ def reward_terms(
         calm = 1 - np.tanh(np.linalg.norm(command, axis=-1))
         r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
         height_error = np.abs(state.log_centre[:, 2] - DESIRED_HEIGHT)
-        r_lift = (1 - np.tanh(omega3 * height_error)) * (1 - r_grapple)
+        r_lift = (1 - np.tanh(height_error)) * (1 - r_grapple)
         r_balance = calm * (1 - r_lift)
     else:
-        r_grapple = 2 * np.minimum(1, np.exp(-3 * omega2 * (d_combine - REACH_DISTANCE))) * closed
-        centred = np.exp(-((centre_miss(state) / CENTRED) ** 2))
-        lift = r_distance * centred * np.sqrt(np.clip(log_clearance(state), 0, 1))
+        near = np.minimum(1, np.exp(-3 * omega2 * (d_combine - REACH_DISTANCE)))
+        off_centre = (centre_miss(state) / CENTRED) ** 2
+        r_grapple = 2 * near * np.exp(-off_centre / 4) * closed
+        clearance = np.maximum(log_clearance(state), 1e-9)  # 0 on the ground; best is 1 m
+        lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))
         held = state.touching.all(axis=-1)
         r_lift, r_balance = 2 * lift, 3 * calm * held * lift
@@ -321,7 +322,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     num_envs: N. env_threads: physics threads, 0 for all cores. frame_skip: physics steps of 5 ms
     per decision, 20 is 10 Hz, 1 the paper's protocol. speed: command limits, a key of SPEEDS.
-    reward: "staged" or "paper", with omega1 (m), omega2 (1/m), omega3 (1/m).
+    reward: "staged" or "paper", with omega2 (1/m).
     offset, signed_yaw: see `relative_pose`. pose_noise: "none", "step" (drawn at every decision)
     or "episode" (drawn once); it touches the observation only.
     diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
@@ -351,9 +352,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         pose_noise: str = "none",
         diameter: float | Array | None = None,
         difficulty: float = 1.0,
-        omega1: float = 1.0,
         omega2: float = 1.0,
-        omega3: float = 1.0,
         env_threads: int = 0,
         render_mode: str | None = None,
         camera: str = "overview",
@@ -371,7 +370,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.frame_skip = _count("frame_skip", frame_skip)
         self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
         self.speed, self.pose_noise = SPEEDS[speed], pose_noise
-        self.omega1, self.omega2, self.omega3 = omega1, omega2, omega3
+        self.omega2 = omega2
         if not 0 <= difficulty <= 1:
             raise ValueError(f"difficulty must lie in [0, 1], got {difficulty}")
         self.difficulty = difficulty
@@ -438,7 +437,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self._rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
         self._start_episodes(np.arange(self.num_envs))
         state = self._state()
-        return self._observe(state), self._info(state, np.zeros((self.num_envs, 6)))
+        pose = relative_pose(state, self.offset)
+        return self._observe(state, pose), self._info(state, pose, np.zeros((self.num_envs, 6)))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
@@ -452,7 +452,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 info["final_obs"][i] = obs[i].copy()
             info["_final_obs"] = info["_final_info"] = done
             self._start_episodes(ended)
-            obs[ended] = self._observe(self._state())[ended]
+            state = self._state()
+            obs[ended] = self._observe(state, relative_pose(state, self.offset))[ended]
         return obs, reward, terminated, truncated, info
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -471,7 +472,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         state = self._state()
         time = self._decisions * self.dt
-        info = self._info(state, command)
+        pose = relative_pose(state, self.offset)
+        info = self._info(state, pose, command)
         reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.where(reach, np.minimum(self._reach_time, time), self._reach_time)
         reached = np.isfinite(self._reach_time)
@@ -488,7 +490,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= conditions | {"termination": ending, "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
         reward = np.where(diverged, 0.0, reward)
-        return self._observe(state), reward, terminated, truncated, info
+        return self._observe(state, pose), reward, terminated, truncated, info
 
     def _simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
@@ -563,9 +565,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             diameter=self._diameter.copy(),
         )
 
-    def _observe(self, state: CraneState) -> Array:
+    def _observe(self, state: CraneState, pose: tuple[Array, Array, Array]) -> Array:
         """Observations (N, 18), float32, inside the observation space."""
-        delta_p, delta_psi, signed_angle = relative_pose(state, self.offset)
+        delta_p, delta_psi, signed_angle = pose
         angle = signed_angle if self.signed_yaw else delta_psi
         if self.pose_noise != "none":
             now = np.minimum(self._decisions, self.max_decisions)
@@ -575,10 +577,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         space = self.single_observation_space
         return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32)
 
-    def _info(self, state: CraneState, command: Array) -> dict[str, Array]:
-        delta_p, delta_psi, _ = relative_pose(state, self.offset)
-        d_combine = np.linalg.norm(delta_p, axis=-1) + self.omega1 * delta_psi
-        terms = reward_terms(state, d_combine, command, self.reward, self.omega2, self.omega3)
+    def _info(
+        self, state: CraneState, pose: tuple[Array, Array, Array], command: Array
+    ) -> dict[str, Array]:
+        delta_p, delta_psi, _ = pose
+        d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
+        terms = reward_terms(state, d_combine, command, self.reward, self.omega2)
         return {
             **dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms.T)),
             "d_combine": d_combine,

@@ -125,12 +125,11 @@ class PlainCrane(gymnasium.Env):
 
         up = min(abs(uz), 1.0)
         clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        grasp = 2 * min(1.0, exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
-        lift = (
-            exp(-d_combine)
-            * exp(-((miss / crane_env.CENTRED) ** 2))
-            * sqrt(min(max(clearance, 0.0), 1.0))
-        )
+        off_centre = (miss / crane_env.CENTRED) ** 2
+        near = min(1.0, exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
+        grasp = 2 * near * exp(-off_centre / 4)
+        clearance = max(clearance, 1e-9)
+        lift = exp(-off_centre) * sqrt(min(clearance, 1 / clearance))
         reward = exp(-d_combine) + grasp * q[7] / crane_env.Q8_MAX + 2 * lift
         if touch[0] > 0 and touch[1] > 0:
             reward += 3 * (1 - tanh(hypot(*command[:5]))) * lift

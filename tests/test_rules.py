@@ -104,31 +104,37 @@ def test_staged_reward():
     lifted = {"log_centre": [4.0, 6.0, 0.45], "grapple_centre": [4.3, 6.125, 0.8]}
     terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
     r, grasp = np.exp(-0.8), 2 * 0.5 * np.exp(-0.3)  # q8 / 3 = 0.5; 0.05 m farther than 0.35 m
-    # 0.125 m off the centre, half of 0.25 m; clearance 0.45 - 0.2 = 0.5^2
+    # 0.125 m off the centre, half of 0.25 m and a quarter of 0.5 m; clearance 0.45 - 0.2 = 0.5^2
     centred, calm = np.exp(-0.25), 1 - np.tanh(0.5)
-    np.testing.assert_allclose(
-        terms, [[r, grasp, 2 * 0.5 * r * centred, 3 * calm * 0.5 * r * centred]]
-    )
-    lifted["grapple_centre"] = [4.0, 7.0, 0.45]
+    lift = 0.5 * centred
+    np.testing.assert_allclose(terms, [[r, grasp * np.exp(-0.0625), 2 * lift, 3 * calm * lift]])
+    farther = crane_env.reward_terms(state(**lifted), np.array([0.9]), COMMAND, omega2=2.0)
+    assert np.all(farther[0, :2] < terms[0, :2])
+    np.testing.assert_array_equal(farther[0, 2:], terms[0, 2:])  # a lift is worth as much anywhere
+    for height in (0.2, 0.15):  # on the ground, and pressed into it
+        down = state(log_centre=[4.0, 6.0, height], grapple_centre=[4.0, 6.0, 0.4])
+        terms = crane_env.reward_terms(down, np.array([0.4]), COMMAND)
+        np.testing.assert_allclose(terms[0, 2:], 0, atol=2e-4)
+    lifted["grapple_centre"] = [4.0, 7.0, 0.45]  # 1 m off
     terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
-    np.testing.assert_allclose(terms, [[r, grasp, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(terms, [[r, grasp * np.exp(-4), 0.0, 0.0]], atol=1e-6)
     one_jaw = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[True, False])
     terms = crane_env.reward_terms(one_jaw, np.array([0.4]), COMMAND, omega2=2.0)
-    np.testing.assert_allclose(terms, [[r, grasp, 2 * 0.5 * r, 0.0]])
-    high = state(log_centre=[4.0, 6.0, 3.2], grapple_centre=[4.0, 6.0, 3.2])
-    terms = crane_env.reward_terms(high, np.array([0.25]), COMMAND)
-    np.testing.assert_allclose(terms[0, 2], 2 * np.exp(-0.25))  # clearance counts up to 1 m
-    near = crane_env.reward_terms(high, np.array([0.34]), COMMAND)
-    np.testing.assert_allclose(near[0, 1], 1.0)  # nearer than 0.35 m is no better for r_grapple
+    np.testing.assert_allclose(terms, [[r, grasp, 2 * 0.5, 0.0]])
+    for clearance, expected in [(1.0, 2.0), (2.25, 2 / 1.5), (4.0, 1.0)]:  # 1 m is best
+        high = state(log_centre=[4, 6, 0.2 + clearance], grapple_centre=[4.0, 6.0, 3.2])
+        terms = crane_env.reward_terms(high, np.array([0.34]), COMMAND)
+        np.testing.assert_allclose(terms[0, 2], expected)
+    np.testing.assert_allclose(terms[0, 1], 1.0)  # nearer than 0.35 m is no better for r_grapple
 
 
 def test_paper_reward():
     terms = crane_env.reward_terms(
-        state(log_centre=[4.0, 6.0, 0.7]), np.array([0.25]), COMMAND, "paper", 2.0, 3.0
+        state(log_centre=[4.0, 6.0, 0.7]), np.array([0.25]), COMMAND, "paper", 2.0
     )
     r = np.exp(-0.5)
     grapple = 0.5 * r + 0.5 * (1 - r)
-    lift = (1 - np.tanh(3.0 * 0.3)) * (1 - grapple)
+    lift = (1 - np.tanh(0.3)) * (1 - grapple)
     balance = (1 - np.tanh(1.3)) * (1 - lift)
     np.testing.assert_allclose(terms, [[r, grapple, lift, balance]])
 
