@@ -85,6 +85,7 @@ class Args:
 
 def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, str]:
     """Maker of an acting function with fresh memory, environment arguments, algorithm name."""
+    path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
         raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
     try:

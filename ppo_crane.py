@@ -31,6 +31,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning, two runs at once would stall
+
 import gymnasium
 import numpy as np
 import torch
@@ -54,7 +56,7 @@ class Args:
     seed: int = 1  # seed of network, policy samples and episodes
     total_timesteps: int = 1_024_000  # decisions to train for, over all cranes, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
+    torch_threads: int = 2  # CPU threads of an update; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
@@ -103,7 +105,8 @@ class Args:
 
 
 LEAST = {  # the smallest values of arguments that have one
-    0: "seed env_threads learning_rate eval_every final_trials eval_seed",
+    0: "seed env_threads learning_rate eval_every final_trials eval_seed reward_scale omega2 "
+    "max_grad_norm vf_coef clip_coef",
     1: "total_timesteps torch_threads num_envs frame_skip num_steps hidden_sizes horizon_growth "
     "minibatch_size update_epochs eval_trials",
 }
@@ -322,6 +325,7 @@ if __name__ == "__main__":
     gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
+    torch.set_num_threads(args.torch_threads)  # rounding, of the first weights too, depends on it
     device = torch.device(args.device)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
@@ -344,11 +348,12 @@ if __name__ == "__main__":
         optimizer.load_state_dict(checkpoint["optimizer"])
         first_iteration = checkpoint["iteration"] + 1
         if first_iteration > num_iterations:
-            print("all updates of this run are done: only its final evaluation is made again")
+            print("all updates of this run are done: only a final evaluation is made again")
         difficulty = checkpoint["difficulty"]
         run_dir = Path(args.resume).parent
     else:
-        run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        started = f"{int(time.time())}_{os.getpid()}"
+        run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{started}"
         run_dir = Path("runs") / run_name.replace("/", "-")
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())

@@ -7,10 +7,12 @@ The paper's second baseline (Vu et al., Sec. IV-B), after Schulman et al., 2015:
   divergence from the old policy permits:
 
     max  g^T s   subject to   1/2 s^T F s <= delta,        g = grad E[rho A],
-    s    = sqrt(2 delta / x^T F x) x,   F x = g            F = Hessian of the KL + d I
-                                                           by conjugate gradient, F v by two
-                                                           backward passes, never F itself
-    accepted: the first of s, c s, c^2 s, ... with KL <= delta and E[rho A] improved, or none;
+    s    = sqrt(2 delta / x^T F x) x,   F x = g            F = Hessian of the KL + d I; x by
+                                                           conjugate gradient over a sample of the
+                                                           rollout, F v by a backward pass through
+                                                           the KL's gradient, never F itself
+    accepted: the first of s, c s, c^2 s, ... with KL <= delta and E[rho A] improved, over the
+              whole rollout, or none;
 
 - the critic is fitted on its own, (V - R)^2 by minibatches.
 
@@ -40,6 +42,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning, two runs at once would stall
+
 import gymnasium
 import numpy as np
 import torch
@@ -63,7 +67,7 @@ class Args:
     seed: int = 1  # seed of network, policy samples and episodes
     total_timesteps: int = 1_024_000  # decisions to train for, over all cranes, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 1  # CPU threads of the networks; results are the same for equal numbers
+    torch_threads: int = 2  # CPU threads of an update; results are the same for equal numbers
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
@@ -99,6 +103,7 @@ class Args:
     max_kl: float = 0.02  # delta, bound of the mean KL divergence of one step
     cg_iterations: int = 15  # of the conjugate gradient
     cg_damping: float = 0.1  # d, added to the diagonal of F
+    fisher_samples: int = 1024  # decisions, drawn anew in each rollout, that F x = g is solved over
     line_search_steps: int = 10  # at most
     line_search_decay: float = 0.8  # c, factor on the step from one to the next
     max_grad_norm: float = 0.5  # bound of the norm of the critic's gradient
@@ -113,9 +118,10 @@ class Args:
 
 
 LEAST = {  # the smallest values of arguments that have one
-    0: "seed env_threads learning_rate eval_every final_trials eval_seed max_kl cg_damping",
+    0: "seed env_threads learning_rate eval_every final_trials eval_seed reward_scale omega2 "
+    "max_grad_norm max_kl cg_damping",
     1: "total_timesteps torch_threads num_envs frame_skip num_steps hidden_sizes horizon_growth "
-    "cg_iterations line_search_steps minibatch_size update_epochs eval_trials",
+    "cg_iterations fisher_samples line_search_steps minibatch_size update_epochs eval_trials",
 }
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
@@ -137,6 +143,7 @@ PAPER = Args(
     gamma=0.99,
     horizon_growth=1.0,
     reward_scale=0.02,
+    fisher_samples=42_000,  # all
     log_std_init=-0.5,
     narrowing=0.0,
     minibatch_size=2000,
@@ -227,11 +234,11 @@ def kl_gradient(agent: Agent, obs: torch.Tensor) -> torch.Tensor:
 
 
 def fisher_vector_product(
-    agent: Agent, gradient: torch.Tensor, damping: float, vector: torch.Tensor
+    agent: Agent, kl_grad: torch.Tensor, damping: float, vector: torch.Tensor
 ) -> torch.Tensor:
     """(F + damping I) vector: the gradient of `kl_gradient`^T vector (Pearlmutter, 1994)."""
     parameters = agent.policy_parameters()
-    product = torch.autograd.grad(gradient @ vector, parameters, retain_graph=True)
+    product = torch.autograd.grad(kl_grad @ vector, parameters, retain_graph=True)
     return flat(product) + damping * vector
 
 
@@ -276,23 +283,23 @@ def line_search(
     accepted the parameters are what they were, and all three are 0.
     """
     parameters = agent.policy_parameters()
-    old_parameters = [p.clone() for p in parameters]
+    before = [p.clone() for p in parameters]
     pieces = full_step.split([p.numel() for p in parameters])
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
     accepted = False
     try:
         for k in range(args.line_search_steps):
             fraction = args.line_search_decay**k
-            for p, old, piece in zip(parameters, old_parameters, pieces):
-                p.copy_(old + fraction * piece.view_as(p))
+            for p, start, piece in zip(parameters, before, pieces):
+                p.copy_(start + fraction * piece.view_as(p))
             surrogate, kl = surrogate_and_kl(agent, *batch)
             accepted = bool(kl <= args.max_kl and surrogate > old_surrogate)
             if accepted:
                 return fraction, kl.item(), (surrogate - old_surrogate).item()
     finally:  # also on Ctrl-C
         if not accepted:
-            for p, old in zip(parameters, old_parameters):
-                p.copy_(old)
+            for p, start in zip(parameters, before):
+                p.copy_(start)
     return 0.0, 0.0, 0.0
 
 
@@ -407,6 +414,8 @@ if __name__ == "__main__":
                 raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
     if not (0 <= args.gamma <= 1 and 0 <= args.gae_lambda <= 1):
         raise SystemExit("--gamma and --gae-lambda must lie in [0, 1]")
+    if not 0 < args.line_search_decay < 1:
+        raise SystemExit("--line-search-decay must lie between 0 and 1")
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
     if batch_size < 2:
@@ -416,6 +425,7 @@ if __name__ == "__main__":
     gae_lambda = args.gae_lambda**tenths
 
     torch.manual_seed(args.seed)
+    torch.set_num_threads(args.torch_threads)  # rounding, of the first weights too, depends on it
     device = torch.device(args.device)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
@@ -438,11 +448,12 @@ if __name__ == "__main__":
         optimizer.load_state_dict(checkpoint["optimizer"])
         first_iteration = checkpoint["iteration"] + 1
         if first_iteration > num_iterations:
-            print("all updates of this run are done: only its final evaluation is made again")
+            print("all updates of this run are done: only a final evaluation is made again")
         difficulty = checkpoint["difficulty"]
         run_dir = Path(args.resume).parent
     else:
-        run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        started = f"{int(time.time())}_{os.getpid()}"
+        run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{started}"
         run_dir = Path("runs") / run_name.replace("/", "-")
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
@@ -555,11 +566,14 @@ if __name__ == "__main__":
             batch = (b_obs, b_actions, b_advantages, old)
             surrogate, _ = surrogate_and_kl(agent, *batch)
             gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-            kl_grad = kl_gradient(agent, b_obs)
+            # the direction by products over a sample, its length by one over the whole rollout
+            sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
+            kl_grad = kl_gradient(agent, b_obs[sample])
             matvec = partial(fisher_vector_product, agent, kl_grad, args.cg_damping)
             direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
-            curvature = direction @ matvec(direction)
-            full_step = torch.sqrt(2 * args.max_kl / (curvature + 1e-12)) * direction
+            kl_grad = kl_gradient(agent, b_obs)
+            product = fisher_vector_product(agent, kl_grad, args.cg_damping, direction)
+            full_step = torch.sqrt(2 * args.max_kl / (direction @ product + 1e-12)) * direction
             step_fraction, kl, improvement = line_search(agent, full_step, batch, args)
             stats: dict[str, list[float]] = {
                 "losses/policy_loss": [-(surrogate.item() + improvement)],

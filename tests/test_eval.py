@@ -174,6 +174,7 @@ def test_clear_errors(tmp_path, monkeypatch):
         return str(error.value)
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
+    assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
     assert "brings its own" in error_of("--no-signed-yaw")

@@ -321,6 +321,7 @@ def test_clear_errors_of_what_the_scripts_share(tmp_path):
     for arguments, message in [
         ("--seed -1", "--seed must be at least 0"),
         ("--hidden-sizes 8 0", "--hidden-sizes must be at least 1"),
+        ("--reward-scale nan", "--reward-scale must be at least 0"),
         ("--gamma 1.01", "--gamma and --gae-lambda must lie in [0, 1]"),
         ("--env-id nowhere:X-v0", "nowhere"),
         ("--horizon-growth 0", "--horizon-growth must be at least 1"),
@@ -330,6 +331,13 @@ def test_clear_errors_of_what_the_scripts_share(tmp_path):
         result = run("mppo_beta", tmp_path, *arguments.split(), check=False)
         assert result.returncode == 1 and "Traceback" not in result.stderr
         assert message in result.stderr
+
+
+def test_two_runs_begun_at_once_have_folders_of_their_own(tmp_path):
+    line = command("ppo", *one_minibatch("ppo"))
+    both = [subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE) for _ in range(2)]
+    assert [process.wait() for process in both] == [0, 0], both[0].stderr.read()
+    assert len(list(tmp_path.glob("runs/*/policy.pt"))) == 2
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

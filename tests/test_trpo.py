@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from script_runs import one_minibatch, only_run, run
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributions import Normal
 
 import trpo_crane
@@ -160,3 +162,25 @@ def test_natural_step_spends_the_divergence_it_is_given():
     fraction, kl, improvement = line_search(agent, step, batch, Args(max_kl=1.01e-6))
     assert fraction == 1 and kl == pytest.approx(1e-6, rel=0.01)
     assert improvement == pytest.approx((gradient @ step).item(), rel=0.01)
+
+
+def test_line_search_must_shorten(tmp_path):
+    result = run("trpo", tmp_path, "--line-search-decay", "1.5", check=False)
+    assert result.returncode == 1
+    assert "--line-search-decay must lie between 0 and 1" in result.stderr
+
+
+def test_direction_from_a_sample_length_from_all(tmp_path):
+    weights = {}
+    for samples in (8, 64, 1024):
+        folder = tmp_path / str(samples)
+        folder.mkdir()
+        run("trpo", folder, *one_minibatch("trpo"), "--fisher-samples", str(samples))
+        policy = torch.load(only_run(folder) / "policy.pt", weights_only=True)
+        weights[samples] = policy["weights"]["actor.0.weight"]
+        events = EventAccumulator(str(only_run(folder))).Reload()
+        assert events.Scalars("trpo/line_search_ok")[0].value == 1
+        # the length leaves the bound to the curvature of all 64, as far as that is constant
+        assert 0.01 < events.Scalars("trpo/kl")[0].value <= 0.02
+    assert not torch.equal(weights[8], weights[64])
+    assert torch.equal(weights[64], weights[1024])  # there are no more than 64
