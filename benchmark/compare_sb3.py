@@ -94,6 +94,7 @@ def train_ours(task: str, algorithm: str, seed: int):
         "gae-lambda": GAE_LAMBDA,
         "reward-scale": t.reward_scale,
         "learning-rate": CRITIC_LEARNING_RATE if algorithm == "trpo" else t.learning_rate,
+        "torch-threads": 1,
         "eval-every": 0,
         "final-trials": 0,
     }
@@ -102,6 +103,7 @@ def train_ours(task: str, algorithm: str, seed: int):
         components = gymnasium.make(task).action_space.shape[0]
         flags |= {"max-kl": MAX_KL * components, "cg-damping": CG_DAMPING * components}
         flags |= {"cg-iterations": CG_ITERATIONS, "max-grad-norm": "inf"}
+        flags["fisher-samples"] = t.num_envs * t.num_steps  # all, as there
     else:
         flags |= {"clip-coef": CLIP, "target-kl": None}
     # no schedules but mPPO's fading perturbation; Gaussians as wide at the start as SB3's, the Beta

@@ -19,6 +19,7 @@ COLUMNS = {
     "time/rollout": "rollout_s",
     "time/update": "update_s",
     "losses/approx_kl": "approx_kl",
+    "trpo/kl": "approx_kl",
     "eval/success_rate": "eval_success_rate",
     "eval/episodic_return": "eval_episodic_return",
     "final/success_rate": "final_success_rate",
@@ -43,7 +44,9 @@ def export(run_dir: Positional[Path], csv_path: Positional[Path]) -> None:
         row["wall_time_s"] = round(row.pop("wall_time") - start, 1)
     csv_path.parent.mkdir(parents=True, exist_ok=True)
     with open(csv_path, "w", newline="") as file:
-        writer = csv.DictWriter(file, ["decisions", "wall_time_s", *COLUMNS.values()])
+        writer = csv.DictWriter(
+            file, ["decisions", "wall_time_s", *dict.fromkeys(COLUMNS.values())]
+        )
         writer.writeheader()
         writer.writerows(rows[step] for step in sorted(rows))
 

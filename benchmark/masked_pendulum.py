@@ -31,7 +31,7 @@ BATCH = NUM_ENVS * NUM_STEPS
 COMMON = f"""--env-id masked_pendulum:MaskedPendulum-v1
 --num-envs {NUM_ENVS} --num-steps {NUM_STEPS} --gamma 0.9 --reward-scale 0.1 --learning-rate 1e-3
 --update-epochs 10 --hidden-sizes 64 64 --log-std-init 0 --horizon-growth 1 --narrowing 0
---no-normalize-obs --no-anneal-lr --target-kl None --eval-every 5"""
+--no-normalize-obs --no-anneal-lr --target-kl None --eval-every 5 --torch-threads 1"""
 OWN = {"ppo": "--minibatch-size 512", "recurrent_ppo": "--num-minibatches 8"}
 
 

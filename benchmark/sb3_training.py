@@ -22,6 +22,7 @@ from crane_env import CraneVectorEnv
 SEED = 1
 CRANES, THREADS = 64, 2  # of CraneVectorEnv
 NETWORK, LSTM, EPOCHS, MINIBATCHES = (256, 256), 64, 8, 4
+FISHER_SAMPLES = 1024  # of TRPO, for its direction
 LOG_STD = -1.2  # as ours start: wilder ones end more episodes
 
 ARRANGEMENTS = [("Dummy", n) for n in (1, 16, 64)] + [("Subproc", n) for n in (2, 4, 8, 16)]
@@ -123,6 +124,8 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
         options |= {"n_critic_updates": options.pop("n_epochs")}
         # SB3 averages the KL divergence over the action's 6 components, ours sums it
         options |= {"target_kl": 0.02 / 6, "cg_damping": 0.1 / 6}
+        # theirs takes gradient and line search over the sample too
+        options |= {"sub_sampling_factor": max(1, rollout // FISHER_SAMPLES)}
     elif algorithm == "RecurrentPPO":  # one memory, as ours; its networks do not see obs beside it
         maker, network = sb3_contrib.RecurrentPPO, "MlpLstmPolicy"
         policy |= {"lstm_hidden_size": LSTM, "shared_lstm": True, "enable_critic_lstm": False}

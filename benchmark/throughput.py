@@ -14,11 +14,11 @@ Last come the ratios that matter, each with a bar to pass and an aim.
   the same task.
 - memory: resident memory of CraneVectorEnv per crane.
 - training: iterations of our scripts and of SB3, from the second on, with the same network,
-  rollout, epochs and minibatch. SB3 has its fastest arrangement of environments, RecurrentPPO also
-  64 at once, the better of 1 and 2 threads, no monitor and no normalised observations; ours have 2
-  threads and else their defaults. It is the start of a training: no crane holds a log yet. "update"
-  is what follows the rollout; ours contains values, log-probabilities and advantages, which SB3
-  computes before.
+  rollout, epochs and minibatch, TRPO's conjugate gradient over 1,024 decisions. SB3 has its fastest
+  arrangement of environments, RecurrentPPO also 64 at once, the better of 1 and 2 threads, no
+  monitor and no normalised observations; ours have 2 threads, all epochs and else their defaults.
+  It is the start of a training: no crane holds a log yet. "update" is what follows the rollout;
+  ours contains values, log-probabilities and advantages, which SB3 computes before.
 """
 
 import csv
@@ -272,8 +272,7 @@ def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, 
         flags |= {"num-minibatches": MINIBATCHES, "lstm-size": LSTM}
     else:
         flags |= {"minibatch-size": rollout // MINIBATCHES}
-    if script != "trpo":
-        flags |= {"target-kl": None}  # all epochs
+    flags |= {"fisher-samples": sb3.FISHER_SAMPLES} if script == "trpo" else {"target-kl": None}
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
     words += ["--hidden-sizes", *map(str, NETWORK)]
     command = [sys.executable, str(ROOT / f"{script}_crane.py"), *words]
