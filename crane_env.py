@@ -436,9 +436,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             # starts and pose noise have streams of their own: noise leaves the starts as they are
             self._rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
         self._start_episodes(np.arange(self.num_envs))
-        state = self._state()
-        pose = relative_pose(state, self.offset)
-        return self._observe(state, pose), self._info(state, pose, np.zeros((self.num_envs, 6)))
+        return self._observe(self._state(), np.zeros((self.num_envs, 6)))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
@@ -452,8 +450,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 info["final_obs"][i] = obs[i].copy()
             info["_final_obs"] = info["_final_info"] = done
             self._start_episodes(ended)
-            state = self._state()
-            obs[ended] = self._observe(state, relative_pose(state, self.offset))[ended]
+            starts, _ = self._observe(self._state(), np.zeros((self.num_envs, 6)))
+            obs[ended] = starts[ended]
         return obs, reward, terminated, truncated, info
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -472,8 +470,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         state = self._state()
         time = self._decisions * self.dt
-        pose = relative_pose(state, self.offset)
-        info = self._info(state, pose, command)
+        obs, info = self._observe(state, command)
         reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.where(reach, np.minimum(self._reach_time, time), self._reach_time)
         reached = np.isfinite(self._reach_time)
@@ -490,7 +487,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= conditions | {"termination": ending, "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
         reward = np.where(diverged, 0.0, reward)
-        return self._observe(state, pose), reward, terminated, truncated, info
+        return obs, reward, terminated, truncated, info
 
     def _simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
@@ -565,9 +562,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             diameter=self._diameter.copy(),
         )
 
-    def _observe(self, state: CraneState, pose: tuple[Array, Array, Array]) -> Array:
-        """Observations (N, 18), float32, inside the observation space."""
-        delta_p, delta_psi, signed_angle = pose
+    def _observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
+        """Observations (N, 18), float32, inside the observation space; what `info` says of them."""
+        delta_p, delta_psi, signed_angle = relative_pose(state, self.offset)
+        d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
+        terms = reward_terms(state, d_combine, command, self.reward, self.omega2)
+        info = dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms.T))
+        info |= {"d_combine": d_combine, "clearance": log_clearance(state)}
+        info["centre_miss"] = centre_miss(state)
         angle = signed_angle if self.signed_yaw else delta_psi
         if self.pose_noise != "none":
             now = np.minimum(self._decisions, self.max_decisions)
@@ -575,20 +577,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             delta_p, angle = noisy_pose(delta_p, angle, epsilon)
         obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
         space = self.single_observation_space
-        return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32)
-
-    def _info(
-        self, state: CraneState, pose: tuple[Array, Array, Array], command: Array
-    ) -> dict[str, Array]:
-        delta_p, delta_psi, _ = pose
-        d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
-        terms = reward_terms(state, d_combine, command, self.reward, self.omega2)
-        return {
-            **dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms.T)),
-            "d_combine": d_combine,
-            "clearance": log_clearance(state),
-            "centre_miss": centre_miss(state),
-        }
+        return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32), info
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
