@@ -131,12 +131,14 @@ def load_model(
     solver: str = "Newton",
     sdf_initpoints: int = 8,
     sdf_iterations: int = 5,
+    visual: bool = True,
 ) -> mujoco.MjModel:
     """Compile assets/crane.xml.
 
     contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
     jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B), with
-    sdf_initpoints starts and sdf_iterations gradient steps of each search for contacts.
+    sdf_initpoints starts and sdf_iterations gradient steps of each search for contacts. Without
+    visual nothing is left that is only drawn: the same motion, a third faster for 64 cranes.
     """
     _choice("contact", contact, ("primitive", "sdf"))
     _choice("integrator", integrator, ("implicitfast", "implicit", "discrete", "Euler"))
@@ -154,7 +156,9 @@ def load_model(
             elif geom.classname.name == "jaw_mesh":
                 geom.type = mujoco.mjtGeom.mjGEOM_SDF
                 geom.conaffinity = log_bit
-        spec.geom("log").contype, spec.geom("log_capsule").contype = log_bit, 0
+        # 8: nothing touches the capsule
+        spec.geom("log").contype, spec.geom("log_capsule").contype = log_bit, 8
+    spec.compiler.discardvisual = not visual
     return spec.compile()
 
 
@@ -284,8 +288,9 @@ def termination_rule(
         np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1) > LOG_RANGE,
         ~reached & (time > REACH_TIME - 1e-9),
         time > TIME_LIMIT - 1e-9,
+        np.ones_like(reached),
     ]
-    return np.select(rules, TERMINATIONS, default="none")
+    return np.array([*TERMINATIONS, "none"])[np.argmax(rules, axis=0)]
 
 
 def success_conditions(
@@ -382,7 +387,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             self.fixed_diameter = np.broadcast_to(d, self.num_envs)
 
-        self.model = model = load_model(**model_options)
+        self.model = model = load_model(**model_options, visual=render_mode is not None)
         self.batch = batch = Batch(model, self.num_envs, env_threads, persistent=True)
         # live views of the engine's arrays, and where in them our joints are
         self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))

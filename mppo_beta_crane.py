@@ -370,7 +370,7 @@ if __name__ == "__main__":
     if not action_space.is_bounded():
         raise SystemExit(f"--env-id: {args.env_id} has unbounded actions, and a Beta needs bounds")
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
     first_iteration = 1
     difficulty = 0.0 if args.curriculum else 1.0

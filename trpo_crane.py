@@ -439,7 +439,9 @@ if __name__ == "__main__":
     if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
         raise SystemExit(f"--env-id: {args.env_id} has no flat Box observations and actions")
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
-    optimizer = torch.optim.Adam(agent.critic.parameters(), lr=args.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(
+        agent.critic.parameters(), lr=args.learning_rate, eps=1e-5, fused=True
+    )
 
     first_iteration = 1
     difficulty = 0.0 if args.curriculum else 1.0
