@@ -27,7 +27,7 @@ Observation, float32, `Box` of shape (18,):
 | 11    | q4 velocity of each stage                        | m/s   | -10     | 10     |
 | 12    | q7 velocity                                      | rad/s | -10     | 10     |
 | 13    | q8 velocity                                      | rad/s | -10     | 10     |
-| 14    | Delta_p,x from grapple centre to log, world axes | m     | -20     | 20     |
+| 14    | Delta_p,x from grapple centre to log, see axes   | m     | -20     | 20     |
 | 15    | Delta_p,y                                        | m     | -20     | 20     |
 | 16    | Delta_p,z, see offset                            | m     | -20     | 20     |
 | 17    | Delta_psi, 0 aligned (signed_yaw: angle in rad)  | 1     | -4.7124 | 4.7124 |
@@ -328,8 +328,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     num_envs: N. env_threads: physics threads, 0 for all cores. frame_skip: physics steps of 5 ms
     per decision, 20 is 10 Hz, 1 the paper's protocol. speed: command limits, a key of SPEEDS.
     reward: "staged" or "paper", with omega2 (1/m).
-    offset, signed_yaw: see `relative_pose`. pose_noise: "none", "step" (drawn at every decision)
-    or "episode" (drawn once); it touches the observation only.
+    offset, signed_yaw: see `relative_pose`. axes of the observed Delta_p: "world", or "crane", x
+    out along the boom and y to its left, which turn with q1. pose_noise: "none", "step" (drawn at
+    every decision) or "episode" (drawn once); it touches the observation only.
     diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
     may be assigned at any time and holds from the next start on.
     model_options: contact, integrator, solver, sdf_initpoints, sdf_iterations of `load_model`.
@@ -354,6 +355,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         speed: str = "real",
         offset: str = "plus",
         signed_yaw: bool = False,
+        axes: str = "world",
         pose_noise: str = "none",
         diameter: float | Array | None = None,
         difficulty: float = 1.0,
@@ -368,13 +370,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         _choice("reward", reward, ("staged", "paper"))
         _choice("speed", speed, tuple(SPEEDS))
         _choice("offset", offset, ("minus", "plus"))
+        _choice("axes", axes, ("world", "crane"))
         _choice("pose_noise", pose_noise, ("none", "step", "episode"))
         _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         _choice("camera", camera, ("overview", "side", "grapple"))
         self.num_envs = _count("num_envs", num_envs)
         self.frame_skip = _count("frame_skip", frame_skip)
         self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
-        self.speed, self.pose_noise = SPEEDS[speed], pose_noise
+        self.speed, self.axes, self.pose_noise = SPEEDS[speed], axes, pose_noise
         self.omega2 = omega2
         if not 0 <= difficulty <= 1:
             raise ValueError(f"difficulty must lie in [0, 1], got {difficulty}")
@@ -580,6 +583,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             now = np.minimum(self._decisions, self.max_decisions)
             epsilon = self._noise[np.arange(self.num_envs), now]
             delta_p, angle = noisy_pose(delta_p, angle, epsilon)
+        if self.axes == "crane":
+            cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
+            delta_p = np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
         obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
         space = self.single_observation_space
         return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32), info

@@ -82,6 +82,7 @@ class Args:
     speed: Literal["real", "mjcf"] = "real"  # joint speed limits
     offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
     signed_yaw: bool = True  # observe the signed angle to the log, not the paper's Delta_psi
+    axes: Literal["crane", "world"] = "crane"  # of Delta_p; crane: along the boom, to its left, up
     pose_noise: Literal["none", "step", "episode"] = "none"  # error of the observed log pose
     integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
     """MuJoCo integrator"""
@@ -134,6 +135,7 @@ PAPER = Args(
     reward="paper",
     offset="minus",
     signed_yaw=False,
+    axes="world",
     integrator="implicit",
     solver="CG",
     num_steps=1000,
@@ -339,7 +341,7 @@ def compute_gae(
 def crane_kwargs(args: Args) -> dict:
     """The crane environment's arguments among args."""
     names = ["frame_skip", "contact", "reward", "omega2", "speed", "offset", "signed_yaw"]
-    names += ["pose_noise", "integrator", "solver", "env_threads"]
+    names += ["axes", "pose_noise", "integrator", "solver", "env_threads"]
     return {name: getattr(args, name) for name in names}
 
 

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from math import atan2, copysign, exp, hypot, pi, sqrt, tanh
+from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt, tanh
 from pathlib import Path
 
 import gymnasium
@@ -16,12 +16,12 @@ import crane_env
 class PlainCrane(gymnasium.Env):
     """One crane with plain MuJoCo calls: scalars, views and addresses looked up once.
 
-    The task of CraneVectorEnv(signed_yaw=True). Two things it is spared: info, and the clip of the
-    observation to its space, which an episode that goes on does not reach.
+    The task of CraneVectorEnv(signed_yaw=True, axes="crane"). Two things it is spared: info, and
+    the clip of the observation to its space, which an episode that goes on does not reach.
     """
 
     def __init__(self, frame_skip: int = 20):
-        self.model = model = crane_env.load_model()
+        self.model = model = crane_env.load_model(visual=False)
         self.data = data = mujoco.MjData(model)
         self.frame_skip, self.dt = frame_skip, frame_skip * crane_env.TIMESTEP
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
@@ -60,8 +60,8 @@ class PlainCrane(gymnasium.Env):
         model.body_inertia[self.log_body] = across, across, mass * radius**2 / 2
         mujoco.mj_setConst(model, data)
         mujoco.mj_resetData(model, data)
-        cos, sin = np.cos(yaw / 2) / sqrt(2), np.sin(yaw / 2) / sqrt(2)
-        self.qpos[self.log_q : self.log_q + 7] = x, y, radius, cos, -cos, -sin, sin
+        c, s = cos(yaw / 2) / sqrt(2), sin(yaw / 2) / sqrt(2)
+        self.qpos[self.log_q : self.log_q + 7] = x, y, radius, c, -c, -s, s
         self.qpos[self.q_at] = q
         self.qpos[self.servo_q] = q[crane_env.ACTUATED][crane_env.COMMAND_OF_SERVO]
         mujoco.mj_step1(model, data)
@@ -133,6 +133,8 @@ class PlainCrane(gymnasium.Env):
         reward = exp(-d_combine) + grasp * q[7] / crane_env.Q8_MAX + 2 * lift
         if touch[0] > 0 and touch[1] > 0:
             reward += 3 * (1 - tanh(hypot(*command[:5]))) * lift
+        cos_q1, sin_q1 = cos(q[0]), sin(q[0])
+        x, y = cos_q1 * x + sin_q1 * y, cos_q1 * y - sin_q1 * x
         return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
 
 

@@ -39,7 +39,9 @@ class CranesForSB3(VecEnv):
     """CraneVectorEnv as SB3 wants it."""
 
     def __init__(self, frame_skip: int):
-        self.envs = CraneVectorEnv(CRANES, frame_skip, signed_yaw=True, env_threads=THREADS)
+        self.envs = CraneVectorEnv(
+            CRANES, frame_skip, signed_yaw=True, axes="crane", env_threads=THREADS
+        )
         spaces = self.envs.single_observation_space, self.envs.single_action_space
         super().__init__(CRANES, *spaces)
 

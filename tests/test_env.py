@@ -73,6 +73,25 @@ def test_observation_holds_what_the_table_says():
     np.testing.assert_allclose(obs[:, 17], delta_psi, atol=1e-5)
 
 
+def test_axes_of_the_crane_turn_with_it():
+    """One pose, seen along the world's axes and along the boom, which points at the grapple."""
+    obs = {}
+    for axes in ("world", "crane"):
+        envs = CraneVectorEnv(8, axes=axes)
+        obs[axes] = envs.reset(seed=0)[0].astype(float)
+    grapple = envs._state().grapple_centre
+    ahead = grapple[:, :2] / np.linalg.norm(grapple[:, :2], axis=-1, keepdims=True)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+    delta_p = obs["world"][:, 14:16]
+    for column, axis in ((14, ahead), (15, left)):  # up to the swing of at most 0.05 rad
+        np.testing.assert_allclose(obs["crane"][:, column], np.sum(delta_p * axis, -1), atol=0.06)
+    np.testing.assert_allclose(
+        np.linalg.norm(obs["crane"][:, 14:16], axis=-1), np.linalg.norm(delta_p, axis=-1), rtol=1e-5
+    )
+    others = [i for i in range(18) if i not in (14, 15)]
+    np.testing.assert_array_equal(obs["crane"][:, others], obs["world"][:, others])
+
+
 def test_observations_stay_in_the_space():
     envs = CraneVectorEnv(32, speed="mjcf", signed_yaw=True, pose_noise="step")
     rng = np.random.default_rng(0)
