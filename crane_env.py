@@ -48,6 +48,7 @@ direction. 0 stops the joint; values outside the box are clipped.
 import ctypes.util
 import os
 import sys
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -129,7 +130,7 @@ def load_model(
     contact: str = "primitive",
     integrator: str = "implicitfast",
     solver: str = "Newton",
-    sdf_initpoints: int = 8,
+    sdf_initpoints: int = 16,
     sdf_iterations: int = 5,
     visual: bool = True,
 ) -> mujoco.MjModel:
@@ -332,7 +333,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     out along the boom and y to its left, which turn with q1. pose_noise: "none", "step" (drawn at
     every decision) or "episode" (drawn once); it touches the observation only.
     diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
-    may be assigned at any time and holds from the next start on.
+    may be assigned at any time and holds from the next start on. retry: share of new episodes that
+    start as one of the crane's last four failures did, for training.
     model_options: contact, integrator, solver, sdf_initpoints, sdf_iterations of `load_model`.
 
     Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
@@ -359,6 +361,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         pose_noise: str = "none",
         diameter: float | Array | None = None,
         difficulty: float = 1.0,
+        retry: float = 0.0,
         omega2: float = 1.0,
         env_threads: int = 0,
         render_mode: str | None = None,
@@ -379,9 +382,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
         self.speed, self.axes, self.pose_noise = SPEEDS[speed], axes, pose_noise
         self.omega2 = omega2
-        if not 0 <= difficulty <= 1:
-            raise ValueError(f"difficulty must lie in [0, 1], got {difficulty}")
-        self.difficulty = difficulty
+        for name, share in (("difficulty", difficulty), ("retry", retry)):
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], got {share}")
+        self.difficulty, self.retry = difficulty, retry
         self.fixed_diameter = None
         if diameter is not None:
             d = np.asarray(diameter, float)
@@ -416,6 +420,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._window = np.zeros((self.num_envs, window, 4))  # clearance, touching (2), miss
         self._noise = np.zeros((self.num_envs, self.max_decisions + 1, 2))
         self._rngs: list[tuple[Generator, Generator]] | None = None
+        self._starts: list[tuple] = [()] * self.num_envs
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
         bound = np.concatenate([np.full(6, 10.0), np.full(3, 20.0), [1.5 * np.pi]])
@@ -443,6 +448,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
             # starts and pose noise have streams of their own: noise leaves the starts as they are
             self._rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
+            self._failures = [deque(maxlen=4) for _ in seeds]
         self._start_episodes(np.arange(self.num_envs))
         return self._observe(self._state(), np.zeros((self.num_envs, 6)))
 
@@ -456,6 +462,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for i in ended:
                 info["final_obs"][i] = obs[i].copy()
+                if not info["success"][i]:
+                    self._failures[i].append(self._starts[i])
             info["_final_obs"] = info["_final_info"] = done
             self._start_episodes(ended)
             starts, _ = self._observe(self._state(), np.zeros((self.num_envs, 6)))
@@ -516,14 +524,18 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return failed | warned | ~finite
 
     def _start_episodes(self, ids: Array) -> None:
-        starts = []
         for i in ids:
-            start_rng, noise_rng = self._rngs[i]
-            starts.append(sample_start(start_rng, self.difficulty))
+            (start_rng, noise_rng), failures = self._rngs[i], self._failures[i]
+            if self.retry and failures and start_rng.random() < self.retry:
+                self._starts[i] = failures[start_rng.integers(len(failures))]
+            else:
+                self._starts[i] = sample_start(start_rng, self.difficulty)
             if self.pose_noise != "none":
                 draws = 1 if self.pose_noise == "episode" else self.max_decisions + 1
                 self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=(draws, 2))
-        q, log_pose, diameter = (np.array(column) for column in zip(*starts))
+        q, log_pose, diameter = (
+            np.array(column) for column in zip(*[self._starts[i] for i in ids])
+        )
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)

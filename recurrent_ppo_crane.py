@@ -81,6 +81,7 @@ class Args:
     integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
     """MuJoCo integrator"""
     solver: Literal["Newton", "CG"] = "Newton"  # MuJoCo constraint solver
+    retry: float = 0.25  # share of episodes that start as a recent failure of that crane did
     curriculum: bool = False  # raise the task's difficulty from 0 to 1 with the success rate
 
     # --- algorithm
@@ -129,6 +130,7 @@ PAPER = Args(
     offset="minus",
     signed_yaw=False,
     axes="world",
+    retry=0.0,
     integrator="implicit",
     solver="CG",
     num_steps=1000,
@@ -371,7 +373,7 @@ if __name__ == "__main__":
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
 
     try:
-        envs = make_envs(args, args.num_envs)
+        envs = make_envs(args, args.num_envs, retry=args.retry)
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space

@@ -253,6 +253,21 @@ def test_pose_noise_is_kept_or_redrawn():
         assert np.abs(factors).max() < 0.1 + 1e-3
 
 
+def test_retry_starts_failures_again():
+    """All fail here: every start but a crane's first is a repeated one, or about half of them."""
+    for retry, low, high in [(0.0, 0, 0), (0.5, 0.35, 0.65), (1.0, 1, 1)]:
+        envs = CraneVectorEnv(32, retry=retry)
+        obs, _ = envs.reset(seed=0)
+        seen, repeated = [{o.tobytes()} for o in obs], []
+        for _ in range(250):
+            obs, _, terminated, truncated, info = envs.step(np.full((32, 6), [0, -1, 0, 0, 0, 0]))
+            assert not info["success"].any()
+            for i in np.flatnonzero(terminated | truncated):
+                repeated.append(obs[i].tobytes() in seen[i])
+                seen[i].add(obs[i].tobytes())
+        assert len(repeated) > 100 and low <= np.mean(repeated) <= high
+
+
 def test_difficulty():
     envs = CraneVectorEnv(64, difficulty=0.0)
     envs.reset(seed=0)
@@ -309,6 +324,7 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"pose_noise": "much"}, "pose_noise"),
         ({"integrator": "RK45"}, "integrator"),
         ({"solver": "LU"}, "solver"),
+        ({"retry": -0.1}, "retry must lie in"),
         ({"difficulty": 1.5}, "difficulty"),
         ({"render_mode": "ascii"}, "render_mode"),
         ({"camera": "back"}, "camera"),
