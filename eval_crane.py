@@ -107,7 +107,7 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         on_crane = module.is_crane(args)
         agent = module.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
         if on_crane:
-            agent.load_state_dict(weights)
+            agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
     except Exception as error:  # whatever a damaged file may raise
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
         raise SystemExit(f"{path} does not fit a {algorithm} policy: {reason}") from None

@@ -91,6 +91,7 @@ class Args:
     gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
     horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run; 1: it stays
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
+    bootstrap: bool = True  # V(final_obs) follows where the time limit cut an episode, else 0
     reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: int = 1024  # decisions per gradient step
     update_epochs: int = 8  # passes over each rollout
@@ -395,16 +396,18 @@ if __name__ == "__main__":
     writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + rows)
 
     def save(iteration: int) -> None:
-        policy = {
+        weights = agent.state_dict()
+        policy = {  # acts without the critic
             "algorithm": ALGORITHM,
             "task": crane_env.REVISION,
             "args": asdict(args),
-            "weights": agent.state_dict(),
+            "weights": {k: v for k, v in weights.items() if not k.startswith("critic.")},
             "global_step": iteration * batch_size,
         }
         writer.flush()
         save_atomically(policy, run_dir / "policy.pt")
         state = {
+            "weights": weights,
             "optimizer": optimizer.state_dict(),
             "iteration": iteration,
             "difficulty": difficulty,
@@ -463,7 +466,9 @@ if __name__ == "__main__":
                 done = terminated | truncated
                 rewards[step] = torch.as_tensor(reward * reward_scale, device=device)
                 dones[step] = torch.as_tensor(done, device=device)
-                terminations[step] = torch.as_tensor(terminated, device=device)
+                terminations[step] = torch.as_tensor(
+                    terminated if args.bootstrap else done, device=device
+                )
 
                 episodic_return += reward
                 episodic_length += 1

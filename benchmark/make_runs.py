@@ -1,0 +1,93 @@
+"""Make the training runs behind the figures: two at a time, one thread each.
+
+    python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
+    python benchmark/make_runs.py ablations   # mPPO without one ingredient, two seeds, 0.6 M
+
+Run it again to go on: what has a CSV is done, what was interrupted resumes from its checkpoint. The
+runs lie in benchmark/runs/, one CSV each in benchmark/curves/ or benchmark/ablations/.
+"""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from export_curve import export
+from tqdm import tqdm
+from tyro.conf import Positional
+
+HERE = Path(__file__).parent
+SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
+SHORT = ["--total-timesteps", "614400"]
+
+# Name: script and flags. At other decision rates as many simulation steps, updates and minibatches.
+ABLATIONS = {
+    "default": ("mppo_beta_crane", []),
+    "reward_paper": ("mppo_beta_crane", ["--reward", "paper"]),
+    "perturb_none": ("mppo_beta_crane", ["--perturb", "none"]),
+    "perturb_rpo": ("mppo_beta_crane", ["--perturb", "rpo"]),
+    "gaussian": ("ppo_crane", ["--learning-rate", "1e-3"]),  # the counterpart of perturb_none
+    "offset_minus": ("mppo_beta_crane", ["--offset", "minus"]),
+    "unsigned_yaw": ("mppo_beta_crane", ["--no-signed-yaw"]),
+    "axes_world": ("mppo_beta_crane", ["--axes", "world"]),
+    "curriculum": ("mppo_beta_crane", ["--curriculum"]),
+    "retry_none": ("mppo_beta_crane", ["--retry", "0"]),
+    "no_bootstrap": ("mppo_beta_crane", ["--no-bootstrap"]),
+    "frame_skip_10": (
+        "mppo_beta_crane",
+        "--frame-skip 10 --num-steps 128 --minibatch-size 2048 --total-timesteps 1228800".split(),
+    ),
+    "frame_skip_4": (
+        "mppo_beta_crane",
+        "--frame-skip 4 --num-steps 320 --minibatch-size 5120 --total-timesteps 3072000".split(),
+    ),
+}
+
+
+def finished(run_dir: Path) -> bool:
+    checkpoint = torch.load(run_dir / "checkpoint.pt", map_location="cpu", weights_only=True)
+    return checkpoint["global_step"] >= checkpoint["args"]["total_timesteps"] // 4096 * 4096
+
+
+def make(folder: str, script: str, name: str, seed: int, flags: list[str]) -> str:
+    """Train (or go on) and export; what happened, in a line."""
+    csv_path = HERE / folder / f"{name}_seed{seed}.csv"
+    if csv_path.exists():
+        return f"{csv_path.name} is there"
+    command = [sys.executable, str(HERE.parent / f"{script}.py"), "--torch-threads", "1"]
+    command += ["--env-threads", "1"]
+    begun = sorted(HERE.glob(f"runs/*__{name}__{seed}__*/checkpoint.pt"))
+    if begun:
+        command += ["--resume", str(begun[-1])]
+    else:
+        command += ["--exp-name", name, "--seed", str(seed), "--eval-every", "25", *flags]
+    with open(HERE / f"{name}_seed{seed}.log", "w") as log:
+        code = subprocess.run(command, cwd=HERE, stdout=log, stderr=log).returncode
+    if code:
+        return f"{name}, seed {seed}: stopped, see {log.name}"
+    (HERE / f"{name}_seed{seed}.log").unlink()
+    csv_path.parent.mkdir(exist_ok=True)
+    export(max(HERE.glob(f"runs/*__{name}__{seed}__*")), csv_path)
+    return f"{csv_path.name} written"
+
+
+def main(what: Positional[Literal["curves", "ablations"]], at_once: int = 2) -> None:
+    """at_once: trainings side by side, one core each."""
+    if what == "curves":
+        jobs = [(what, script, script, seed, []) for seed in (1, 2, 3) for script in SCRIPTS]
+    else:
+        jobs = [
+            (what, script, name, seed, [*SHORT, *flags])
+            for seed in (1, 2)
+            for name, (script, flags) in ABLATIONS.items()
+        ]
+    with ThreadPoolExecutor(at_once) as pool:
+        for line in tqdm(pool.map(lambda job: make(*job), jobs), total=len(jobs)):
+            tqdm.write(line)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
