@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
-import torch
 import tyro
 from export_curve import export
 from tqdm import tqdm
@@ -45,11 +44,6 @@ ABLATIONS = {
         "--frame-skip 4 --num-steps 320 --minibatch-size 5120 --total-timesteps 3072000".split(),
     ),
 }
-
-
-def finished(run_dir: Path) -> bool:
-    checkpoint = torch.load(run_dir / "checkpoint.pt", map_location="cpu", weights_only=True)
-    return checkpoint["global_step"] >= checkpoint["args"]["total_timesteps"] // 4096 * 4096
 
 
 def make(folder: str, script: str, name: str, seed: int, flags: list[str]) -> str:

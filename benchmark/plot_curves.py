@@ -1,4 +1,4 @@
-"""Draw benchmark/curves/*.csv into assets/figures/learning_curves.png; say when each run got there.
+"""Draw curves/*.csv and ablations/*.csv into assets/figures, and print what they say as tables.
 
 A run is there with the first evaluation at or above the paper's 96.3 % after which none falls below
 95 %; minutes are those of rollouts and updates, without evaluations, as the run was run.
@@ -13,58 +13,109 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 HERE = Path(__file__).parent
+FIGURES = HERE.parent / "assets" / "figures"
+Run = dict[str, np.ndarray]  # columns, NaN where nothing was recorded
 
 
-def column(rows: list[dict], x: str, y: str, scale: float) -> tuple[list[float], list[float]]:
-    """Points of the rows in which y was recorded."""
-    rows = [row for row in rows if row[y]]
-    return [float(row[x]) * scale for row in rows], [100 * float(row[y]) for row in rows]
+def read(folder: str) -> dict[str, list[Run]]:
+    """Runs by name, one a seed."""
+    runs: dict[str, list[Run]] = {}
+    for path in sorted((HERE / folder).glob("*_seed*.csv")):
+        with open(path) as file:
+            rows = list(csv.DictReader(file))
+        run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
+        run["minutes"] = np.nancumsum(run["rollout_s"] + run["update_s"]) / 60
+        runs.setdefault(path.stem.split("_seed")[0], []).append(run)
+    return runs
 
 
-def first_lasting(rows: list[dict], level: float = 0.963, floor: float = 0.95) -> dict | None:
+def recorded(run: Run, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
+    there = np.isfinite(run[y])
+    return run[x][there], run[y][there]
+
+
+def first_lasting(run: Run, level: float = 0.963, floor: float = 0.95) -> int | None:
     """Row of the first evaluation at level after which none is below floor."""
-    judged = [row for row in rows if row["eval_success_rate"]]
-    for i, row in enumerate(judged):
-        later = min(float(other["eval_success_rate"]) for other in judged[i:])
-        if float(row["eval_success_rate"]) >= level and later >= floor:
-            return row
+    rows = np.flatnonzero(np.isfinite(run["eval_success_rate"]))
+    for row in rows:
+        success = run["eval_success_rate"][rows[rows >= row]]
+        if success[0] >= level and success.min() >= floor:
+            return int(row)
     return None
 
 
-def main() -> None:
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
-    scripts: list[str] = []  # one colour each, whatever the seed
-    for path in sorted((HERE / "curves").glob("*_seed*.csv")):
-        with open(path) as file:
-            rows = list(csv.DictReader(file))
-        there = first_lasting(rows)
-        if there is not None:
-            decisions = int(there["decisions"])
-            until = [row for row in rows if int(row["decisions"]) <= decisions]
-            seconds = sum(float(row["rollout_s"]) + float(row["update_s"]) for row in until)
-            print(f"{path.stem}: {decisions / 1e6:.2f} M decisions, {seconds / 60:.1f} min")
-        script = path.stem.split("_seed")[0]
-        label = script if script not in scripts else None
-        scripts += [script] if label else []
-        color = f"C{scripts.index(script)}"
-        for axis, x, scale in ((left, "decisions", 1e-6), (right, "wall_time_s", 1 / 60)):
-            training = column(rows, x, "training_success_rate", scale)
-            axis.plot(*training, color=color, alpha=0.35, linewidth=1)
-            axis.plot(*column(rows, x, "eval_success_rate", scale), ".-", color=color, label=label)
-    left.set_xlabel("decisions [million]")
-    right.set_xlabel("wall clock [min]")
-    left.set_ylabel("success [%]")
-    left.legend(
-        fontsize=7, loc="lower right", title="thick: mean action, thin: training", title_fontsize=7
-    )
+def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style) -> None:
+    """Mean over seeds, their spread shaded; runs of one name are recorded at the same updates."""
+    points = [recorded(run, x, y) for run in runs]
+    shortest = min(len(xs) for xs, _ in points)
+    xs, ys = (np.array([point[k][:shortest] for point in points]) for k in (0, 1))
+    axis.plot(xs.mean(0) * scale, ys.mean(0), **style)
+    axis.fill_between(xs.mean(0) * scale, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
+
+
+def learning_curves(runs: dict[str, list[Run]]) -> None:
+    axes_of = [
+        ("decisions", 1e-6, "decisions [million]"),
+        ("decisions", 20e-6, "simulation steps [million]"),
+        ("updates", 1, "updates"),
+        ("minutes", 1, "minutes of training"),
+    ]
+    rows = [("eval_success_rate", "success of the mean action"), ("episodic_return", "return")]
+    figure, axes = plt.subplots(2, 4, figsize=(13, 5.2), sharey="row")
+    for color, (name, seeds) in enumerate(runs.items()):
+        for line, (y, title) in enumerate(rows):
+            for column, (x, scale, unit) in enumerate(axes_of):
+                axis = axes[line, column]
+                draw(axis, seeds, x, y, scale, color=f"C{color}", label=f"{name} ({len(seeds)})")
+                axis.set_xlabel(unit)
+                axis.grid(alpha=0.3)
+            axes[line, 0].set_ylabel(title)
+        for seed, run in enumerate(seeds, 1):
+            row = first_lasting(run)
+            if row is not None:
+                there = f"{run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
+                print(f"{name}, seed {seed}: 96.3 % for good after {there}")
+    axes[0, 0].legend(fontsize=7, title="(seeds)", title_fontsize=7)
+    figure.tight_layout()
+    figure.savefig(FIGURES / "learning_curves.png", dpi=100)
+
+
+def ablations(runs: dict[str, list[Run]]) -> None:
+    """Success of every seed's final policy, and how soon half of its trials succeed."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), sharey=True)
+    names = sorted(runs, key=lambda name: (name != "default", name))
+    print("| ablation | final success %, seeds | half succeed at [million decisions] |\n|-|-|-|")
+    for height, name in enumerate(reversed(names)):
+        final = [
+            100 * recorded(run, "decisions", "final_success_rate")[1][-1] for run in runs[name]
+        ]
+        half = []
+        for run in runs[name]:
+            decisions, success = recorded(run, "decisions", "training_success_rate")
+            half.append(
+                decisions[np.argmax(success > 0.5)] / 1e6 if success.max() > 0.5 else np.nan
+            )
+        left.plot(final, [height] * len(final), "o")
+        right.plot(half, [height] * len(half), "o")
+        print(f"| {name} | {', '.join(f'{x:.1f}' for x in final)} | ", end="")
+        print(", ".join(f"{x:.2f}" if np.isfinite(x) else "never" for x in half), "|")
+    left.set_yticks(range(len(names)), list(reversed(names)))
+    left.set_xlabel("success of the final policy [%]")
+    right.set_xlabel("decisions until half of the training episodes succeed [million]")
     for axis in (left, right):
         axis.grid(alpha=0.3)
-        axis.set_ylim(0, 100)
     figure.tight_layout()
-    figure.savefig(HERE.parent / "assets" / "figures" / "learning_curves.png", dpi=130)
+    figure.savefig(FIGURES / "ablations.png", dpi=100)
+
+
+def main() -> None:
+    learning_curves(read("curves"))
+    if (HERE / "ablations").is_dir():
+        ablations(read("ablations"))
 
 
 if __name__ == "__main__":
