@@ -139,7 +139,7 @@ def load_model(
     contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
     jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B), with
     sdf_initpoints starts and sdf_iterations gradient steps of each search for contacts. Without
-    visual nothing is left that is only drawn: the same motion, a third faster for 64 cranes.
+    visual nothing is left that is only drawn: the same motion, sooner (assets/README.md).
     """
     _choice("contact", contact, ("primitive", "sdf"))
     _choice("integrator", integrator, ("implicitfast", "implicit", "discrete", "Euler"))
@@ -157,7 +157,7 @@ def load_model(
             elif geom.classname.name == "jaw_mesh":
                 geom.type = mujoco.mjtGeom.mjGEOM_SDF
                 geom.conaffinity = log_bit
-        # 8: nothing touches the capsule
+        # 8, which nothing touches: without a bit discardvisual would take the capsule
         spec.geom("log").contype, spec.geom("log_capsule").contype = log_bit, 8
     spec.compiler.discardvisual = not visual
     return spec.compile()
@@ -333,11 +333,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     out along the boom and y to its left, which turn with q1. pose_noise: "none", "step" (drawn at
     every decision) or "episode" (drawn once); it touches the observation only.
     diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
-    may be assigned at any time and holds from the next start on. retry: share of new episodes that
-    start as one of the crane's last four failures did, for training.
-    model_options: contact, integrator, solver, sdf_initpoints, sdf_iterations of `load_model`.
+    may be assigned at any time and holds from the next new start on. retry: for training, share of
+    episodes that start as one of the crane's last four failures did, repeated ones included.
+    model_options: arguments of `load_model`; visual only with a render_mode where not given.
 
-    Crane i's episodes depend on the seed and i alone, not on N or the number of threads.
+    Crane i's starts depend on the seed and i alone, with retry on its own failures too, but not on
+    N or the number of threads.
 
     `info` describes the step just made, for every crane, also one that ended with it:
     `termination` (of TERMINATIONS, or "none"), the terms r_distance, r_grapple, r_lift, r_balance,
@@ -394,7 +395,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             self.fixed_diameter = np.broadcast_to(d, self.num_envs)
 
-        self.model = model = load_model(**model_options, visual=render_mode is not None)
+        self.model = model = load_model(**{"visual": render_mode is not None, **model_options})
         self.batch = batch = Batch(model, self.num_envs, env_threads, persistent=True)
         # live views of the engine's arrays, and where in them our joints are
         self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
@@ -462,8 +463,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for i in ended:
                 info["final_obs"][i] = obs[i].copy()
-                if not info["success"][i]:
-                    self._failures[i].append(self._starts[i])
             info["_final_obs"] = info["_final_info"] = done
             self._start_episodes(ended)
             starts, _ = self._observe(self._state(), np.zeros((self.num_envs, 6)))
@@ -503,6 +502,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= conditions | {"termination": ending, "time_to_reach": self._reach_time}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
         reward = np.where(diverged, 0.0, reward)
+        for i in np.flatnonzero((ending != "none") & ~info["success"]):
+            self._failures[i].append(self._starts[i])
         return obs, reward, terminated, truncated, info
 
     def _simulate(self, command: Array) -> Array:

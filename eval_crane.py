@@ -90,7 +90,8 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        algorithm, args = str(saved["algorithm"]), dict(saved["args"])
+        algorithm = str(saved["algorithm"])
+        args = {"axes": "world"} | dict(saved["args"])  # as they were before one could choose
         weights = saved["weights"]
     except Exception:
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
@@ -107,6 +108,7 @@ def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, 
         on_crane = module.is_crane(args)
         agent = module.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
         if on_crane:
+            # policy.pt has no critic, and acting needs none
             agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
     except Exception as error:  # whatever a damaged file may raise
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()

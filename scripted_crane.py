@@ -1,6 +1,7 @@
 """A scripted crane: resolved-rate control and four phases, the classical rival of the policies.
 
-It sees what a policy sees, the 18 numbers of the observation, and learns nothing. It knows the
+It sees what a policy sees, the 18 numbers of the observation (with axes "world"), and learns
+nothing. It knows the
 crane's lengths and speed limits (assets/README.md) and that Delta_p is 0 where the jaws' tips just
 clear the ground, whatever the log's diameter (offset "plus").
 

@@ -99,7 +99,7 @@ class Args:
     gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
     horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run; 1: it stays
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    bootstrap: bool = True  # V(final_obs) follows where the time limit cut an episode, else 0
+    bootstrap: bool = True  # count V(final_obs) where the time limit cuts an episode; off: 0
     reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: int = 1024  # decisions per gradient step of the critic
     update_epochs: int = 8  # passes of the critic over each rollout
@@ -533,9 +533,8 @@ if __name__ == "__main__":
                 done = terminated | truncated
                 rewards[step] = torch.as_tensor(reward * reward_scale, device=device)
                 dones[step] = torch.as_tensor(done, device=device)
-                terminations[step] = torch.as_tensor(
-                    terminated if args.bootstrap else done, device=device
-                )
+                worthless = terminated if args.bootstrap else done  # V(s_{t+1}) is 0
+                terminations[step] = torch.as_tensor(worthless, device=device)
 
                 episodic_return += reward
                 episodic_length += 1

@@ -128,6 +128,7 @@ def train_ours(task: str, algorithm: str, seed: int):
         agent = module.Agent(
             env.observation_space.shape[0], low, high, module.Args(**saved["args"])
         )
+        # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **saved["weights"]})
 
     @torch.no_grad()

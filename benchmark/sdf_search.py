@@ -22,7 +22,7 @@ from tyro.conf import Positional  # noqa: E402
 import eval_crane  # noqa: E402
 from crane_env import monte_carlo_trials  # noqa: E402
 
-SETTINGS = [(40, 10), (20, 10), (10, 10), (8, 5), (4, 5), (4, 3), (2, 3)]
+SETTINGS = [(40, 10), (20, 10), (10, 10), (16, 5), (8, 5), (4, 5)]
 SEED, TRIALS = 30_000, 20  # trials per diameter
 
 

@@ -254,7 +254,7 @@ def test_pose_noise_is_kept_or_redrawn():
 
 
 def test_retry_starts_failures_again():
-    """All fail here: every start but a crane's first is a repeated one, or about half of them."""
+    """Every episode fails here; after a crane's first start none, half or all are repeats."""
     for retry, low, high in [(0.0, 0, 0), (0.5, 0.35, 0.65), (1.0, 1, 1)]:
         envs = CraneVectorEnv(32, retry=retry)
         obs, _ = envs.reset(seed=0)
@@ -266,6 +266,29 @@ def test_retry_starts_failures_again():
                 repeated.append(obs[i].tobytes() in seen[i])
                 seen[i].add(obs[i].tobytes())
         assert len(repeated) > 100 and low <= np.mean(repeated) <= high
+        assert max(len(failures) for failures in envs._failures) == 4
+    envs.reset(seed=0)
+    assert not any(envs._failures)
+
+
+def test_retry_leaves_successes_alone(monkeypatch):
+    """Idle cranes: first every episode counts as a success, then none."""
+
+    def starts(env, episodes):
+        seen = set()
+        for _ in range(episodes):
+            seen.add(env.reset()[0].tobytes())
+            while not any(env.step(np.zeros(6))[2:4]):
+                pass
+        return seen
+
+    env = crane_env.CraneEnv(retry=1.0)
+    env.reset(seed=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(crane_env, "REACH_DISTANCE", 100.0)
+        patch.setattr(crane_env, "success_conditions", lambda *_: {"success": np.ones(1, bool)})
+        assert len(starts(env, 3)) == 3
+    assert len(starts(env, 3)) == 1
 
 
 def test_difficulty():

@@ -190,7 +190,10 @@ def test_two_updates_on_the_crane_same_seed_same_weights(tmp_path, algorithm):
         run(algorithm, folder, *arguments, "--seed", seed)
         policy = torch.load(only_run(folder) / "policy.pt", weights_only=True)
         assert policy["algorithm"] == algorithm and policy["global_step"] == 768
-        weights.append(policy["weights"])
+        checkpoint = torch.load(only_run(folder) / "checkpoint.pt", weights_only=True)
+        assert not any(k.startswith("critic.") for k in policy["weights"])
+        assert "critic.0.weight" in checkpoint["weights"]
+        weights.append(checkpoint["weights"])
     assert all(torch.equal(weights[0][k], weights[1][k]) for k in weights[0])
     assert not torch.equal(weights[0]["actor.0.weight"], weights[2]["actor.0.weight"])
     values = scalars(only_run(tmp_path / "0"))
