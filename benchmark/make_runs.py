@@ -3,8 +3,9 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
     python benchmark/make_runs.py ablations   # mPPO without one ingredient, two seeds, 0.6 M
 
-Run it again to go on: what has a CSV is done, what was interrupted resumes from its checkpoint. The
-runs lie in benchmark/runs/, one CSV each in benchmark/curves/ or benchmark/ablations/.
+Run it again to go on: what has a CSV is done (delete it to make the run again), what was interrupted
+resumes from its checkpoint. The runs lie in benchmark/runs/ (delete them after a change of the
+task), one CSV each in benchmark/curves/ or benchmark/ablations/.
 """
 
 import subprocess
@@ -20,7 +21,7 @@ from tyro.conf import Positional
 
 HERE = Path(__file__).parent
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
-SHORT = ["--total-timesteps", "614400"]
+SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
 # Name: script and flags. At other decision rates as many simulation steps, updates and minibatches.
 ABLATIONS = {
@@ -57,7 +58,7 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str]) -> st
     if begun:
         command += ["--resume", str(begun[-1])]
     else:
-        command += ["--exp-name", name, "--seed", str(seed), "--eval-every", "25", *flags]
+        command += ["--exp-name", name, "--seed", str(seed), *flags]
     with open(HERE / f"{name}_seed{seed}.log", "w") as log:
         code = subprocess.run(command, cwd=HERE, stdout=log, stderr=log).returncode
     if code:
@@ -71,7 +72,8 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str]) -> st
 def main(what: Positional[Literal["curves", "ablations"]], at_once: int = 2) -> None:
     """at_once: trainings side by side, one core each."""
     if what == "curves":
-        jobs = [(what, script, script, seed, []) for seed in (1, 2, 3) for script in SCRIPTS]
+        often = ["--eval-every", "25"]
+        jobs = [(what, name, name, seed, often) for seed in (1, 2, 3) for name in SCRIPTS]
     else:
         jobs = [
             (what, script, name, seed, [*SHORT, *flags])

@@ -1,4 +1,4 @@
-"""Draw curves/*.csv and ablations/*.csv into assets/figures, and print what they say as tables.
+"""Draw curves/*.csv and ablations/*.csv into assets/figures, and print what they say.
 
 A run is there with the first evaluation at or above the paper's 96.3 % after which none falls below
 95 %; minutes are those of rollouts and updates, without evaluations, as the run was run.
@@ -28,6 +28,7 @@ def read(folder: str) -> dict[str, list[Run]]:
         with open(path) as file:
             rows = list(csv.DictReader(file))
         run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
+        run["seed"] = path.stem.split("_seed")[1]
         run["minutes"] = np.nancumsum(run["rollout_s"] + run["update_s"]) / 60
         runs.setdefault(path.stem.split("_seed")[0], []).append(run)
     return runs
@@ -49,12 +50,12 @@ def first_lasting(run: Run, level: float = 0.963, floor: float = 0.95) -> int | 
 
 
 def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style) -> None:
-    """Mean over seeds, their spread shaded; runs of one name are recorded at the same updates."""
+    """Mean over seeds at the first one's points, their spread shaded."""
     points = [recorded(run, x, y) for run in runs]
-    shortest = min(len(xs) for xs, _ in points)
-    xs, ys = (np.array([point[k][:shortest] for point in points]) for k in (0, 1))
-    axis.plot(xs.mean(0) * scale, ys.mean(0), **style)
-    axis.fill_between(xs.mean(0) * scale, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
+    xs = points[0][0][points[0][0] <= min(x[-1] for x, _ in points)]
+    ys = np.array([np.interp(xs, *point) for point in points])
+    axis.plot(xs * scale, ys.mean(0), **style)
+    axis.fill_between(xs * scale, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
 
 
 def learning_curves(runs: dict[str, list[Run]]) -> None:
@@ -74,38 +75,36 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
                 axis.set_xlabel(unit)
                 axis.grid(alpha=0.3)
             axes[line, 0].set_ylabel(title)
-        for seed, run in enumerate(seeds, 1):
-            row = first_lasting(run)
+        for run in seeds:
+            row, when = first_lasting(run), "never"
             if row is not None:
-                there = f"{run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
-                print(f"{name}, seed {seed}: 96.3 % for good after {there}")
+                when = f"after {run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
+            print(f"{name}, seed {run['seed']}: 96.3 % for good {when}")
     axes[0, 0].legend(fontsize=7, title="(seeds)", title_fontsize=7)
     figure.tight_layout()
     figure.savefig(FIGURES / "learning_curves.png", dpi=100)
 
 
 def ablations(runs: dict[str, list[Run]]) -> None:
-    """Success of every seed's final policy, and how soon half of its trials succeed."""
+    """Success of every seed's final policy, and the first update whose policy has half of it."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), sharey=True)
     names = sorted(runs, key=lambda name: (name != "default", name))
-    print("| ablation | final success %, seeds | half succeed at [million decisions] |\n|-|-|-|")
+    print("| ablation | final success %, seeds | half succeed after [updates] |\n|-|-|-|")
     for height, name in enumerate(reversed(names)):
         final = [
             100 * recorded(run, "decisions", "final_success_rate")[1][-1] for run in runs[name]
         ]
         half = []
         for run in runs[name]:
-            decisions, success = recorded(run, "decisions", "training_success_rate")
-            half.append(
-                decisions[np.argmax(success > 0.5)] / 1e6 if success.max() > 0.5 else np.nan
-            )
+            updates, success = recorded(run, "updates", "eval_success_rate")
+            half.append(updates[np.argmax(success >= 0.5)] if success.max() >= 0.5 else np.nan)
         left.plot(final, [height] * len(final), "o")
         right.plot(half, [height] * len(half), "o")
         print(f"| {name} | {', '.join(f'{x:.1f}' for x in final)} | ", end="")
-        print(", ".join(f"{x:.2f}" if np.isfinite(x) else "never" for x in half), "|")
+        print(", ".join(f"{x:.0f}" if np.isfinite(x) else "never" for x in half), "|")
     left.set_yticks(range(len(names)), list(reversed(names)))
     left.set_xlabel("success of the final policy [%]")
-    right.set_xlabel("decisions until half of the training episodes succeed [million]")
+    right.set_xlabel("updates until the mean action succeeds in half of its trials")
     for axis in (left, right):
         axis.grid(alpha=0.3)
     figure.tight_layout()
