@@ -3,9 +3,9 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
     python benchmark/make_runs.py ablations   # mPPO without one ingredient, two seeds, 0.6 M
 
-Run it again to go on: what has a CSV is done (delete it to make the run again), what was interrupted
-resumes from its checkpoint. The runs lie in benchmark/runs/ (delete them after a change of the
-task), one CSV each in benchmark/curves/ or benchmark/ablations/.
+Run it again to go on: what has a CSV is done (delete it to make the run again), what was
+interrupted resumes from its checkpoint. The runs lie in benchmark/runs/ (delete them after a change
+of the task), one CSV each in benchmark/curves/ or benchmark/ablations/.
 """
 
 import subprocess
