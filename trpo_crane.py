@@ -87,7 +87,7 @@ class Args:
     integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
     """MuJoCo integrator"""
     solver: Literal["Newton", "CG"] = "Newton"  # MuJoCo constraint solver
-    retry: float = 0.25  # share of episodes that start as a recent failure of that crane did
+    retry: float = 0.0  # share of episodes that start as a recent failure of that crane did
     curriculum: bool = False  # raise the task's difficulty from 0 to 1 with the success rate
 
     # --- algorithm
@@ -138,7 +138,6 @@ PAPER = Args(
     offset="minus",
     signed_yaw=False,
     axes="world",
-    retry=0.0,
     integrator="implicit",
     solver="CG",
     num_steps=1000,
