@@ -79,7 +79,8 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
             row, when = first_lasting(run), "never"
             if row is not None:
                 when = f"after {run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
-            print(f"{name}, seed {run['seed']}: 96.3 % for good {when}")
+            total = f"{run['minutes'][-1]:.1f} min in all"
+            print(f"{name}, seed {run['seed']}: 96.3 % for good {when}; {total}")
     axes[0, 0].legend(fontsize=7, title="(seeds)", title_fontsize=7)
     figure.tight_layout()
     figure.savefig(FIGURES / "learning_curves.png", dpi=100)
