@@ -38,9 +38,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning, two runs at onc
 import gymnasium
 import numpy as np
 import torch
-import torch.nn as nn
 import tyro
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from torch import Tensor, nn
 from torch.distributions import Beta
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import trange
@@ -123,34 +124,14 @@ LEAST = {  # the smallest values of arguments that have one
 }
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
-PAPER = Args(
-    paper=True,
-    total_timesteps=500_000_000,
-    num_envs=42,
-    frame_skip=1,
-    contact="sdf",
-    reward="paper",
-    offset="minus",
-    signed_yaw=False,
-    axes="world",
-    retry=0.0,
-    integrator="implicit",
-    solver="CG",
-    num_steps=1000,
-    hidden_sizes=(256, 256, 256, 256),
-    learning_rate=3e-4,
-    anneal_lr=False,
-    gamma=0.99,
-    horizon_growth=1.0,
-    reward_scale=0.02,
-    minibatch_size=2000,
-    update_epochs=30,
-    target_kl=None,
-    anneal_perturbation=False,
-    log_excess_init=0.0,
-    narrowing=0.0,
-    log_excess_max=3.5,  # a Beta narrower than a lasting perturbation takes it for outliers
-)
+# log_excess_max: a Beta narrower than a lasting perturbation takes it for outliers.
+PAPER = """
+--paper --total-timesteps 500_000_000 --num-envs 42 --frame-skip 1 --contact sdf --reward paper
+--offset minus --no-signed-yaw --axes world --retry 0 --integrator implicit --solver CG
+--num-steps 1000 --hidden-sizes 256 256 256 256 --learning-rate 3e-4 --no-anneal-lr --gamma 0.99
+--horizon-growth 1 --reward-scale 0.02 --minibatch-size 2000 --update-epochs 30 --target-kl None
+--no-anneal-perturbation --log-excess-init 0 --narrowing 0 --log-excess-max 3.5
+"""
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, clip range, minibatch size, reward scale, weights of value loss and entropy, gradient bound,
 tanh units, no annealing, normalised observations and advantages, alpha and beta at the start, their
@@ -188,7 +169,7 @@ class Agent(nn.Module):
             inputs = width
         return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
 
-    def update_normalizer(self, obs: torch.Tensor) -> None:
+    def update_normalizer(self, obs: Tensor) -> None:
         """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
         obs = obs.double()
         count = self.obs_count + len(obs)
@@ -198,32 +179,32 @@ class Agent(nn.Module):
         self.obs_mean.add_(delta * len(obs) / count)
         self.obs_count.copy_(count)
 
-    def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+    def normalize(self, obs: Tensor) -> Tensor:
         """(obs - mean) / std within +-10, what the networks take; `predict` takes raw ones."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
-    def get_value(self, obs: torch.Tensor) -> torch.Tensor:
+    def get_value(self, obs: Tensor) -> Tensor:
         """V(s), (B,)."""
         return self.critic(obs).squeeze(-1)
 
-    def get_distribution(self, obs: torch.Tensor) -> Beta:
+    def get_distribution(self, obs: Tensor) -> Beta:
         """Beta over a_n in [0, 1], batch shape (B, act_dim), alpha and beta above 1."""
         bound = self.log_excess_max
         log_excess = bound * torch.tanh(self.actor(obs) / bound)
         alpha, beta = (1 + log_excess.exp()).chunk(2, dim=-1)
         return Beta(alpha, beta, validate_args=False)
 
-    def predict(self, obs: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
+    def predict(self, obs: Tensor, deterministic: bool = True) -> Tensor:
         """Actions (B, act_dim) in the environment's units, without perturbation."""
         distribution = self.get_distribution(self.normalize(obs))
         return self.to_env(distribution.mean if deterministic else distribution.sample())
 
-    def to_env(self, actions: torch.Tensor) -> torch.Tensor:
+    def to_env(self, actions: Tensor) -> Tensor:
         return self.action_low + (self.action_high - self.action_low) * actions
 
 
-def shift_mean(distribution: Beta, shift: torch.Tensor) -> Beta:
+def shift_mean(distribution: Beta, shift: Tensor) -> Beta:
     """The Beta with its mean moved by shift at equal concentration, alpha and beta kept above 1."""
     alpha, beta = distribution.concentration1, distribution.concentration0
     concentration = alpha + beta
@@ -232,41 +213,32 @@ def shift_mean(distribution: Beta, shift: torch.Tensor) -> Beta:
     return Beta(moved, concentration - moved, validate_args=False)
 
 
-def perturb_actions(actions: torch.Tensor, epsilon: float) -> torch.Tensor:
+def perturb_actions(actions: Tensor, epsilon: float) -> Tensor:
     """Eq. (robust ppo): clip(a_n + g, 0, 1), g ~ U(-epsilon, epsilon); A_MIN off the ends."""
     noise = torch.empty_like(actions).uniform_(-1, 1) * epsilon
     return (actions + noise).clamp(A_MIN, 1 - A_MIN)
 
 
 def bootstrap_values(
-    values: torch.Tensor,
-    last_value: torch.Tensor,
-    terminations: torch.Tensor,
-    cut_at: list[tuple[int, int]],
-    cut_values: torch.Tensor | None,
-) -> torch.Tensor:
+    values: Tensor, last_value: Tensor, terminal: Tensor, cut_at: list, cut_values: Tensor | None
+) -> Tensor:
     """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
     next_values = torch.cat([values[1:], last_value[None]])
     if cut_at:
         steps, cranes = zip(*cut_at)
         next_values[steps, cranes] = cut_values
-    return next_values * (1 - terminations)
+    return next_values * (1 - terminal)
 
 
 def compute_gae(
-    rewards: torch.Tensor,
-    values: torch.Tensor,
-    next_values: torch.Tensor,
-    dones: torch.Tensor,
-    gamma: float,
-    gae_lambda: float,
-) -> torch.Tensor:
+    rewards: Tensor, values: Tensor, next_values: Tensor, dones: Tensor, gamma: float, lam: float
+) -> Tensor:
     """Advantages (T, N) from rewards, values, `bootstrap_values` and episode ends, all (T, N)."""
     advantages = torch.zeros_like(rewards)
     last = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_values[t] - values[t]
-        last = delta + gamma * gae_lambda * (1 - dones[t]) * last
+        last = delta + gamma * lam * (1 - dones[t]) * last
         advantages[t] = last
     return advantages
 
@@ -323,23 +295,20 @@ def save_atomically(contents: dict, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__, default=PAPER if "--paper" in sys.argv else Args())
+    default = tyro.cli(Args, args=PAPER.split()) if "--paper" in sys.argv else Args()
+    args = tyro.cli(Args, description=__doc__, default=default)
     checkpoint = None
     if args.resume is not None:
-        if not Path(args.resume).is_file():
-            raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
             checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
-            saved = dict(checkpoint["args"])
-            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
-        except Exception:
-            ours = False
-        if not ours:
-            raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        task = checkpoint.get("task")
-        if saved.keys() != asdict(args).keys() or task != crane_env.REVISION:
-            raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
-        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
+            made_by = checkpoint["algorithm"], checkpoint["task"], "optimizer" in checkpoint
+            if made_by != (ALGORITHM, crane_env.REVISION, True):
+                raise ValueError("of another algorithm or revision, or a policy.pt")
+            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+            args = Args(**checkpoint["args"] | machine)
+        except Exception as error:
+            needed = f"--resume needs a checkpoint.pt of {ALGORITHM}, got {args.resume}"
+            raise SystemExit(f"{needed}: {error}") from None
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
@@ -365,7 +334,7 @@ if __name__ == "__main__":
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
 
     try:
-        envs = make_envs(args, args.num_envs, retry=args.retry)
+        envs = RecordEpisodeStatistics(make_envs(args, args.num_envs, retry=args.retry), 200)
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -428,8 +397,7 @@ if __name__ == "__main__":
         torch.manual_seed(reset_seed)
     next_obs, _ = envs.reset(seed=reset_seed)
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
-    episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
-    recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
+    recent_success = deque(maxlen=200)
     start_time = time.time()
 
     completed = first_iteration - 1
@@ -469,23 +437,19 @@ if __name__ == "__main__":
                 worthless = terminated if args.bootstrap else done  # V(s_{t+1}) is 0
                 terminations[step] = torch.as_tensor(worthless, device=device)
 
-                episodic_return += reward
-                episodic_length += 1
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
                         cut_at.append((step, i))
                         last_obs = torch.as_tensor(info["final_obs"][i], dtype=torch.float32)
                         cut_obs.append(agent.normalize(last_obs.to(device)))
-                    ended["return"].append(episodic_return[i])
-                    ended["length"].append(episodic_length[i])
+                    ended["return"].append(info["episode"]["r"][i])
+                    ended["length"].append(info["episode"]["l"][i])
                     if is_crane(args):
                         ended["termination"].append(info["termination"][i])
                         recent_success.append(info["success"][i])
-                episodic_return[done], episodic_length[done] = 0, 0
                 if is_crane(args):
                     for name in terms:
                         terms[name] += info[name].mean() / args.num_steps
-            recent_returns.extend(ended["return"])
             global_step = iteration * batch_size
             update_start = time.time()
 
@@ -589,9 +553,8 @@ if __name__ == "__main__":
                         recent_success.clear()
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
-            shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
-            if is_crane(args) and recent_success:
-                shown["success"] = np.mean(recent_success)
+            shown = {"return": envs.return_queue, "success": recent_success}
+            shown = {name: np.mean(recent) for name, recent in shown.items() if recent}
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")

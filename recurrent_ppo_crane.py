@@ -39,9 +39,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning, two runs at onc
 import gymnasium
 import numpy as np
 import torch
-import torch.nn as nn
 import tyro
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from torch import Tensor, nn
 from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import trange
@@ -51,7 +52,7 @@ import crane_env
 ALGORITHM = "recurrent_ppo"
 MACHINE_ARGS = ("resume", "device", "torch_threads", "env_threads")  # not taken from a checkpoint
 
-State = tuple[torch.Tensor, torch.Tensor]  # h and c of the LSTM, (N, lstm_size) each
+State = tuple[Tensor, Tensor]  # h and c of the LSTM, (N, lstm_size) each
 
 
 @dataclass
@@ -121,32 +122,13 @@ LEAST = {  # the smallest values of arguments that have one
 }
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
-PAPER = Args(
-    paper=True,
-    total_timesteps=500_000_000,
-    num_envs=42,
-    frame_skip=1,
-    contact="sdf",
-    reward="paper",
-    offset="minus",
-    signed_yaw=False,
-    axes="world",
-    retry=0.0,
-    integrator="implicit",
-    solver="CG",
-    num_steps=1000,
-    hidden_sizes=(256, 256, 256, 256),
-    learning_rate=3e-4,
-    anneal_lr=False,
-    gamma=0.99,
-    horizon_growth=1.0,
-    reward_scale=0.02,
-    log_std_init=-0.5,
-    narrowing=0.0,
-    num_minibatches=21,
-    update_epochs=30,
-    target_kl=None,
-)
+PAPER = """
+--paper --total-timesteps 500_000_000 --num-envs 42 --frame-skip 1 --contact sdf --reward paper
+--offset minus --no-signed-yaw --axes world --retry 0 --integrator implicit --solver CG
+--num-steps 1000 --hidden-sizes 256 256 256 256 --learning-rate 3e-4 --no-anneal-lr --gamma 0.99
+--horizon-growth 1 --reward-scale 0.02 --log-std-init -0.5 --narrowing 0 --num-minibatches 21
+--update-epochs 30 --target-kl None
+"""
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, clip range, minibatches, reward scale, weights of value loss and entropy, gradient bound,
 LSTM units, tanh units, no annealing, normalised observations and advantages, sigma at the start,
@@ -184,7 +166,7 @@ class Agent(nn.Module):
             inputs = width
         return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
 
-    def update_normalizer(self, obs: torch.Tensor) -> None:
+    def update_normalizer(self, obs: Tensor) -> None:
         """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
         obs = obs.double()
         count = self.obs_count + len(obs)
@@ -194,7 +176,7 @@ class Agent(nn.Module):
         self.obs_mean.add_(delta * len(obs) / count)
         self.obs_count.copy_(count)
 
-    def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+    def normalize(self, obs: Tensor) -> Tensor:
         """(obs - mean) / std within +-10, what the networks take; `predict` takes raw ones."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
@@ -203,9 +185,7 @@ class Agent(nn.Module):
         zeros = self.obs_mean.new_zeros((2, num_envs, self.lstm.hidden_size), dtype=torch.float32)
         return zeros[0], zeros[1]
 
-    def remember(
-        self, obs: torch.Tensor, state: State, starts: torch.Tensor
-    ) -> tuple[torch.Tensor, State]:
+    def remember(self, obs: Tensor, state: State, starts: Tensor) -> tuple[Tensor, State]:
         """Features of obs (T, N, obs_dim) with the memory of what came before, and the last state.
 
         state: h and c, (N, lstm_size), before obs[0]. starts (T, N) is 1 where obs begins an
@@ -219,18 +199,18 @@ class Agent(nn.Module):
             memories.append(h)
         return torch.cat([obs, torch.stack(memories)], dim=-1), (h, c)
 
-    def get_value(self, features: torch.Tensor) -> torch.Tensor:
+    def get_value(self, features: Tensor) -> Tensor:
         """V of features (..., obs_dim + lstm_size)."""
         return self.critic(features).squeeze(-1)
 
-    def get_distribution(self, features: torch.Tensor) -> Normal:
+    def get_distribution(self, features: Tensor) -> Normal:
         """Gaussian over actions, batch shape (..., act_dim), before clipping to the limits."""
         mean = self.actor(features)
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
 
     def predict(
-        self, obs: torch.Tensor, state: State, deterministic: bool = True
-    ) -> tuple[torch.Tensor, State]:
+        self, obs: Tensor, state: State, deterministic: bool = True
+    ) -> tuple[Tensor, State]:
         """Actions (N, act_dim) in the environment's units, and the state that follows."""
         x, starts = self.normalize(obs)[None], torch.zeros(1, len(obs)).to(obs)
         features, state = self.remember(x, state, starts)
@@ -238,39 +218,30 @@ class Agent(nn.Module):
         actions = distribution.mean if deterministic else distribution.sample()
         return self.to_env(actions), state
 
-    def to_env(self, actions: torch.Tensor) -> torch.Tensor:
+    def to_env(self, actions: Tensor) -> Tensor:
         return torch.clamp(actions, self.action_low, self.action_high)
 
 
 def bootstrap_values(
-    values: torch.Tensor,
-    last_value: torch.Tensor,
-    terminations: torch.Tensor,
-    cut_at: list[tuple[int, int]],
-    cut_values: torch.Tensor | None,
-) -> torch.Tensor:
+    values: Tensor, last_value: Tensor, terminal: Tensor, cut_at: list, cut_values: Tensor | None
+) -> Tensor:
     """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
     next_values = torch.cat([values[1:], last_value[None]])
     if cut_at:
         steps, cranes = zip(*cut_at)
         next_values[steps, cranes] = cut_values
-    return next_values * (1 - terminations)
+    return next_values * (1 - terminal)
 
 
 def compute_gae(
-    rewards: torch.Tensor,
-    values: torch.Tensor,
-    next_values: torch.Tensor,
-    dones: torch.Tensor,
-    gamma: float,
-    gae_lambda: float,
-) -> torch.Tensor:
+    rewards: Tensor, values: Tensor, next_values: Tensor, dones: Tensor, gamma: float, lam: float
+) -> Tensor:
     """Advantages (T, N) from rewards, values, `bootstrap_values` and episode ends, all (T, N)."""
     advantages = torch.zeros_like(rewards)
     last = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_values[t] - values[t]
-        last = delta + gamma * gae_lambda * (1 - dones[t]) * last
+        last = delta + gamma * lam * (1 - dones[t]) * last
         advantages[t] = last
     return advantages
 
@@ -329,23 +300,20 @@ def save_atomically(contents: dict, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__, default=PAPER if "--paper" in sys.argv else Args())
+    default = tyro.cli(Args, args=PAPER.split()) if "--paper" in sys.argv else Args()
+    args = tyro.cli(Args, description=__doc__, default=default)
     checkpoint = None
     if args.resume is not None:
-        if not Path(args.resume).is_file():
-            raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
             checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
-            saved = dict(checkpoint["args"])
-            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
-        except Exception:
-            ours = False
-        if not ours:
-            raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        task = checkpoint.get("task")
-        if saved.keys() != asdict(args).keys() or task != crane_env.REVISION:
-            raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
-        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
+            made_by = checkpoint["algorithm"], checkpoint["task"], "optimizer" in checkpoint
+            if made_by != (ALGORITHM, crane_env.REVISION, True):
+                raise ValueError("of another algorithm or revision, or a policy.pt")
+            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+            args = Args(**checkpoint["args"] | machine)
+        except Exception as error:
+            needed = f"--resume needs a checkpoint.pt of {ALGORITHM}, got {args.resume}"
+            raise SystemExit(f"{needed}: {error}") from None
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
@@ -374,7 +342,7 @@ if __name__ == "__main__":
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
 
     try:
-        envs = make_envs(args, args.num_envs, retry=args.retry)
+        envs = RecordEpisodeStatistics(make_envs(args, args.num_envs, retry=args.retry), 200)
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -437,8 +405,7 @@ if __name__ == "__main__":
     next_obs, _ = envs.reset(seed=reset_seed)
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
-    episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
-    recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
+    recent_success = deque(maxlen=200)
     start_time = time.time()
 
     completed = first_iteration - 1
@@ -477,24 +444,20 @@ if __name__ == "__main__":
                 worthless = terminated if args.bootstrap else done  # V(s_{t+1}) is 0
                 terminations[step] = torch.as_tensor(worthless, device=device)
 
-                episodic_return += reward
-                episodic_length += 1
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
                         cut_at.append((step, i))
                         last_obs = torch.as_tensor(info["final_obs"][i], dtype=torch.float32)
                         cut_obs.append(agent.normalize(last_obs.to(device)))
                         cut_states.append(torch.stack([part[i] for part in state]))
-                    ended["return"].append(episodic_return[i])
-                    ended["length"].append(episodic_length[i])
+                    ended["return"].append(info["episode"]["r"][i])
+                    ended["length"].append(info["episode"]["l"][i])
                     if is_crane(args):
                         ended["termination"].append(info["termination"][i])
                         recent_success.append(info["success"][i])
-                episodic_return[done], episodic_length[done] = 0, 0
                 if is_crane(args):
                     for name in terms:
                         terms[name] += info[name].mean() / args.num_steps
-            recent_returns.extend(ended["return"])
             global_step = iteration * batch_size
             update_start = time.time()
 
@@ -594,9 +557,8 @@ if __name__ == "__main__":
                         recent_success.clear()
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
-            shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
-            if is_crane(args) and recent_success:
-                shown["success"] = np.mean(recent_success)
+            shown = {"return": envs.return_queue, "success": recent_success}
+            shown = {name: np.mean(recent) for name, recent in shown.items() if recent}
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")

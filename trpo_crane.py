@@ -37,6 +37,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -47,9 +48,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning, two runs at onc
 import gymnasium
 import numpy as np
 import torch
-import torch.nn as nn
 import tyro
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import trange
@@ -128,31 +130,13 @@ LEAST = {  # the smallest values of arguments that have one
 }
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
-PAPER = Args(
-    paper=True,
-    total_timesteps=500_000_000,
-    num_envs=42,
-    frame_skip=1,
-    contact="sdf",
-    reward="paper",
-    offset="minus",
-    signed_yaw=False,
-    axes="world",
-    integrator="implicit",
-    solver="CG",
-    num_steps=1000,
-    hidden_sizes=(256, 256, 256, 256),
-    learning_rate=3e-4,
-    anneal_lr=False,
-    gamma=0.99,
-    horizon_growth=1.0,
-    reward_scale=0.02,
-    fisher_samples=42_000,  # all
-    log_std_init=-0.5,
-    narrowing=0.0,
-    minibatch_size=2000,
-    update_epochs=30,
-)
+PAPER = """
+--paper --total-timesteps 500_000_000 --num-envs 42 --frame-skip 1 --contact sdf --reward paper
+--offset minus --no-signed-yaw --axes world --integrator implicit --solver CG --num-steps 1000
+--hidden-sizes 256 256 256 256 --learning-rate 3e-4 --no-anneal-lr --gamma 0.99 --horizon-growth 1
+--reward-scale 0.02 --fisher-samples 42_000 --log-std-init -0.5 --narrowing 0
+--minibatch-size 2000 --update-epochs 30
+"""
 PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
 lambda, delta, conjugate gradient, line search, minibatch size, reward scale, gradient bound,
 tanh units, no annealing, normalised observations and advantages, sigma at the start,
@@ -188,7 +172,7 @@ class Agent(nn.Module):
             inputs = width
         return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
 
-    def update_normalizer(self, obs: torch.Tensor) -> None:
+    def update_normalizer(self, obs: Tensor) -> None:
         """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
         obs = obs.double()
         count = self.obs_count + len(obs)
@@ -198,16 +182,16 @@ class Agent(nn.Module):
         self.obs_mean.add_(delta * len(obs) / count)
         self.obs_count.copy_(count)
 
-    def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+    def normalize(self, obs: Tensor) -> Tensor:
         """(obs - mean) / std within +-10, what the networks take; `predict` takes raw ones."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
-    def get_value(self, obs: torch.Tensor) -> torch.Tensor:
+    def get_value(self, obs: Tensor) -> Tensor:
         """V(s), (B,)."""
         return self.critic(obs).squeeze(-1)
 
-    def get_distribution(self, obs: torch.Tensor) -> Normal:
+    def get_distribution(self, obs: Tensor) -> Normal:
         """Gaussian over actions, batch shape (B, act_dim), before clipping to the limits."""
         mean = self.actor(obs)
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
@@ -215,21 +199,21 @@ class Agent(nn.Module):
     def policy_parameters(self) -> list[nn.Parameter]:
         return [*self.actor.parameters(), self.log_std]
 
-    def predict(self, obs: torch.Tensor, deterministic: bool = True) -> torch.Tensor:
+    def predict(self, obs: Tensor, deterministic: bool = True) -> Tensor:
         """Actions (B, act_dim) in the environment's units."""
         distribution = self.get_distribution(self.normalize(obs))
         return self.to_env(distribution.mean if deterministic else distribution.sample())
 
-    def to_env(self, actions: torch.Tensor) -> torch.Tensor:
+    def to_env(self, actions: Tensor) -> Tensor:
         return torch.clamp(actions, self.action_low, self.action_high)
 
 
-def flat(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
+def flat(tensors: Iterable[Tensor]) -> Tensor:
     """All elements in one vector."""
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-def kl_gradient(agent: Agent, obs: torch.Tensor) -> torch.Tensor:
+def kl_gradient(agent: Agent, obs: Tensor) -> Tensor:
     """Gradient of the mean KL(pi_old || pi) over obs at pi = pi_old: 0, but with its graph."""
     distribution = agent.get_distribution(obs)
     old = Normal(distribution.loc.detach(), distribution.scale.detach(), validate_args=False)
@@ -237,9 +221,7 @@ def kl_gradient(agent: Agent, obs: torch.Tensor) -> torch.Tensor:
     return flat(torch.autograd.grad(kl, agent.policy_parameters(), create_graph=True))
 
 
-def fisher_vector_product(
-    agent: Agent, kl_grad: torch.Tensor, damping: float, vector: torch.Tensor
-) -> torch.Tensor:
+def fisher_vector_product(agent: Agent, kl_grad: Tensor, damping: float, vector: Tensor) -> Tensor:
     """(F + damping I) vector: the gradient of `kl_gradient`^T vector (Pearlmutter, 1994)."""
     parameters = agent.policy_parameters()
     product = torch.autograd.grad(kl_grad @ vector, parameters, retain_graph=True)
@@ -247,8 +229,8 @@ def fisher_vector_product(
 
 
 def conjugate_gradient(
-    matvec: Callable[[torch.Tensor], torch.Tensor], b: torch.Tensor, iterations: int
-) -> tuple[torch.Tensor, float]:
+    matvec: Callable[[Tensor], Tensor], b: Tensor, iterations: int
+) -> tuple[Tensor, float]:
     """x with matvec(x) = b for a symmetric positive matrix, and its residual's norm over b's."""
     x, residual = torch.zeros_like(b), b.clone()
     direction, residual_sq = b.clone(), b @ b
@@ -266,8 +248,8 @@ def conjugate_gradient(
 
 
 def surrogate_and_kl(
-    agent: Agent, obs: torch.Tensor, actions: torch.Tensor, advantages: torch.Tensor, old: Normal
-) -> tuple[torch.Tensor, torch.Tensor]:
+    agent: Agent, obs: Tensor, actions: Tensor, advantages: Tensor, old: Normal
+) -> tuple[Tensor, Tensor]:
     """E[rho A] and the mean KL divergence from the old policy, of the agent as it is."""
     distribution = agent.get_distribution(obs)
     ratio = (distribution.log_prob(actions) - old.log_prob(actions)).sum(-1).exp()
@@ -276,66 +258,46 @@ def surrogate_and_kl(
 
 @torch.no_grad()
 def line_search(
-    agent: Agent,
-    full_step: torch.Tensor,
-    batch: tuple[torch.Tensor, torch.Tensor, torch.Tensor, Normal],
-    args: Args,
+    agent: Agent, full_step: Tensor, batch: tuple[Tensor, Tensor, Tensor, Normal], args: Args
 ) -> tuple[float, float, float]:
     """Move the policy along full_step; the accepted fraction of it, the KL and the improvement.
 
     batch: obs, actions, advantages and old policy of `surrogate_and_kl`. Where no fraction is
     accepted the parameters are what they were, and all three are 0.
     """
-    parameters = agent.policy_parameters()
-    before = [p.clone() for p in parameters]
-    pieces = full_step.split([p.numel() for p in parameters])
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
-    accepted = False
-    try:
-        for k in range(args.line_search_steps):
-            fraction = args.line_search_decay**k
-            for p, start, piece in zip(parameters, before, pieces):
-                p.copy_(start + fraction * piece.view_as(p))
-            surrogate, kl = surrogate_and_kl(agent, *batch)
-            accepted = bool(kl <= args.max_kl and surrogate > old_surrogate)
-            if accepted:
-                return fraction, kl.item(), (surrogate - old_surrogate).item()
-    finally:  # also on Ctrl-C
-        if not accepted:
-            for p, start in zip(parameters, before):
-                p.copy_(start)
+    start = flat(agent.policy_parameters())
+    trial = deepcopy(agent)  # the agent stays whole, also where Ctrl-C comes in between
+    for k in range(args.line_search_steps):
+        fraction = args.line_search_decay**k
+        nn.utils.vector_to_parameters(start + fraction * full_step, trial.policy_parameters())
+        surrogate, kl = surrogate_and_kl(trial, *batch)
+        if kl <= args.max_kl and surrogate > old_surrogate:
+            agent.load_state_dict(trial.state_dict())
+            return fraction, kl.item(), (surrogate - old_surrogate).item()
     return 0.0, 0.0, 0.0
 
 
 def bootstrap_values(
-    values: torch.Tensor,
-    last_value: torch.Tensor,
-    terminations: torch.Tensor,
-    cut_at: list[tuple[int, int]],
-    cut_values: torch.Tensor | None,
-) -> torch.Tensor:
+    values: Tensor, last_value: Tensor, terminal: Tensor, cut_at: list, cut_values: Tensor | None
+) -> Tensor:
     """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
     next_values = torch.cat([values[1:], last_value[None]])
     if cut_at:
         steps, cranes = zip(*cut_at)
         next_values[steps, cranes] = cut_values
-    return next_values * (1 - terminations)
+    return next_values * (1 - terminal)
 
 
 def compute_gae(
-    rewards: torch.Tensor,
-    values: torch.Tensor,
-    next_values: torch.Tensor,
-    dones: torch.Tensor,
-    gamma: float,
-    gae_lambda: float,
-) -> torch.Tensor:
+    rewards: Tensor, values: Tensor, next_values: Tensor, dones: Tensor, gamma: float, lam: float
+) -> Tensor:
     """Advantages (T, N) from rewards, values, `bootstrap_values` and episode ends, all (T, N)."""
     advantages = torch.zeros_like(rewards)
     last = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_values[t] - values[t]
-        last = delta + gamma * gae_lambda * (1 - dones[t]) * last
+        last = delta + gamma * lam * (1 - dones[t]) * last
         advantages[t] = last
     return advantages
 
@@ -392,23 +354,20 @@ def save_atomically(contents: dict, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__, default=PAPER if "--paper" in sys.argv else Args())
+    default = tyro.cli(Args, args=PAPER.split()) if "--paper" in sys.argv else Args()
+    args = tyro.cli(Args, description=__doc__, default=default)
     checkpoint = None
     if args.resume is not None:
-        if not Path(args.resume).is_file():
-            raise SystemExit(f"--resume: no file {args.resume}; give a run's checkpoint.pt")
         try:
             checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
-            saved = dict(checkpoint["args"])
-            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
-        except Exception:
-            ours = False
-        if not ours:
-            raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of {ALGORITHM}")
-        task = checkpoint.get("task")
-        if saved.keys() != asdict(args).keys() or task != crane_env.REVISION:
-            raise SystemExit(f"--resume: {args.resume} is of another revision of this script")
-        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
+            made_by = checkpoint["algorithm"], checkpoint["task"], "optimizer" in checkpoint
+            if made_by != (ALGORITHM, crane_env.REVISION, True):
+                raise ValueError("of another algorithm or revision, or a policy.pt")
+            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
+            args = Args(**checkpoint["args"] | machine)
+        except Exception as error:
+            needed = f"--resume needs a checkpoint.pt of {ALGORITHM}, got {args.resume}"
+            raise SystemExit(f"{needed}: {error}") from None
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
@@ -435,7 +394,7 @@ if __name__ == "__main__":
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
 
     try:
-        envs = make_envs(args, args.num_envs, retry=args.retry)
+        envs = RecordEpisodeStatistics(make_envs(args, args.num_envs, retry=args.retry), 200)
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -498,8 +457,7 @@ if __name__ == "__main__":
         torch.manual_seed(reset_seed)
     next_obs, _ = envs.reset(seed=reset_seed)
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
-    episodic_return, episodic_length = np.zeros(args.num_envs), np.zeros(args.num_envs, int)
-    recent_returns, recent_success = deque(maxlen=200), deque(maxlen=200)
+    recent_success = deque(maxlen=200)
     start_time = time.time()
 
     completed = first_iteration - 1
@@ -535,23 +493,19 @@ if __name__ == "__main__":
                 worthless = terminated if args.bootstrap else done  # V(s_{t+1}) is 0
                 terminations[step] = torch.as_tensor(worthless, device=device)
 
-                episodic_return += reward
-                episodic_length += 1
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
                         cut_at.append((step, i))
                         last_obs = torch.as_tensor(info["final_obs"][i], dtype=torch.float32)
                         cut_obs.append(agent.normalize(last_obs.to(device)))
-                    ended["return"].append(episodic_return[i])
-                    ended["length"].append(episodic_length[i])
+                    ended["return"].append(info["episode"]["r"][i])
+                    ended["length"].append(info["episode"]["l"][i])
                     if is_crane(args):
                         ended["termination"].append(info["termination"][i])
                         recent_success.append(info["success"][i])
-                episodic_return[done], episodic_length[done] = 0, 0
                 if is_crane(args):
                     for name in terms:
                         terms[name] += info[name].mean() / args.num_steps
-            recent_returns.extend(ended["return"])
             global_step = iteration * batch_size
             update_start = time.time()
 
@@ -643,9 +597,8 @@ if __name__ == "__main__":
                         recent_success.clear()
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
-            shown = {"return": np.mean(recent_returns) if recent_returns else float("nan")}
-            if is_crane(args) and recent_success:
-                shown["success"] = np.mean(recent_success)
+            shown = {"return": envs.return_queue, "success": recent_success}
+            shown = {name: np.mean(recent) for name, recent in shown.items() if recent}
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")

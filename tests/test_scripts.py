@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 from script_runs import (
     ALGORITHMS,
     ROOT,
@@ -225,7 +226,8 @@ def test_paper_protocol(tmp_path, algorithm):
     assert args["frame_skip"] == 1 and args["contact"] == "sdf" and args["reward"] == "paper"
     assert args["integrator"] == "implicit" and args["solver"] == "CG" and args["num_envs"] == 2
     assert args["offset"] == "minus" and not args["signed_yaw"]
-    paper = module(algorithm).PAPER
+    paper = tyro.cli(module(algorithm).Args, args=module(algorithm).PAPER.split())
+    assert paper.paper and paper.total_timesteps == 500_000_000 and not paper.anneal_lr
     assert paper.horizon_growth == 1 and paper.narrowing == 0
     assert paper.num_envs == 42 and paper.num_steps == 1000 and paper.update_epochs == 30
     assert paper.gamma == 0.99 and paper.reward_scale == 0.02
@@ -302,16 +304,22 @@ ONE_SAMPLE = {
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_clear_errors(tmp_path, algorithm):
-    torch.save({"algorithm": "other", "args": {}, "optimizer": {}}, tmp_path / "other.pt")
-    old = {"algorithm": algorithm, "args": {"seed": 1}, "optimizer": {}}
-    torch.save(old, tmp_path / "old.pt")
-    now = {**old, "args": vars(module(algorithm).Args()), "task": crane_env.REVISION - 1}
-    torch.save(now, tmp_path / "task.pt")
+    args = vars(module(algorithm).Args())
+    ours = {"algorithm": algorithm, "task": crane_env.REVISION, "args": args, "optimizer": {}}
+    for name, change in {
+        "other": {"algorithm": "other"},
+        "task": {"task": crane_env.REVISION - 1},
+        "option": {"args": {"warp": 9}},
+    }.items():
+        torch.save({**ours, **change}, tmp_path / f"{name}.pt")
+    torch.save({k: v for k, v in ours.items() if k != "optimizer"}, tmp_path / "policy.pt")
+    needed = f"--resume needs a checkpoint.pt of {algorithm}, got "
     for arguments, message in [
-        ("--resume nowhere.pt", "--resume: no file nowhere.pt"),
-        ("--resume other.pt", f"is no checkpoint.pt of {algorithm}"),
-        ("--resume old.pt", "old.pt is of another revision"),
-        ("--resume task.pt", "task.pt is of another revision"),
+        ("--resume nowhere.pt", needed + "nowhere.pt: [Errno 2] No such file"),
+        ("--resume other.pt", needed + "other.pt: of another algorithm or revision"),
+        ("--resume task.pt", needed + "task.pt: of another algorithm or revision"),
+        ("--resume policy.pt", "or a policy.pt"),
+        ("--resume option.pt", "unexpected keyword argument 'warp'"),
         ("--num-envs 0", "--num-envs must be at least 1"),
         (ONE_SAMPLE[algorithm], "standard deviation"),
     ]:

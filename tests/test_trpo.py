@@ -132,11 +132,11 @@ def test_interrupted_line_search_restores_exactly(monkeypatch):
     step, calls = 50 * ascent(agent, batch), []
     surrogate_and_kl = trpo_crane.surrogate_and_kl
 
-    def interrupted(*arguments):
-        calls.append(flat(p.detach() for p in agent.policy_parameters()))
+    def interrupted(trial, *batch):
+        calls.append(flat(p.detach() for p in trial.policy_parameters()))
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return surrogate_and_kl(*arguments)
+        return surrogate_and_kl(trial, *batch)
 
     monkeypatch.setattr(trpo_crane, "surrogate_and_kl", interrupted)
     with pytest.raises(KeyboardInterrupt):
