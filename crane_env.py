@@ -70,22 +70,18 @@ MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 REVISION = 6  # of the task; raise it when a change spoils policies or checkpoints
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators
-LOG_LENGTH = 2.75  # m
-LOG_DENSITY = 650.0  # kg/m^3
+LOG_LENGTH, LOG_DENSITY = 2.75, 650.0  # m, kg/m^3
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
 POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
 POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
-TIME_LIMIT = 9.0  # s
-REACH_TIME = 6.0  # s
-REACH_DISTANCE = 0.35  # m, bound of d_combine
+TIME_LIMIT, HOLD_TIME = 9.0, 0.5  # s, an episode, and its end in which the log must be held
+REACH_TIME, REACH_DISTANCE = 6.0, 0.35  # s, m: by then d_combine must have been below this
 LOG_RANGE = 8.0  # m, between grapple centre and log centre
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
-HOLD_TIME = 0.5  # s at the end of the episode
-MIN_CLEARANCE = 0.1  # m below the log's lowest point
-MAX_MISS = 0.3  # m along the log
+MIN_CLEARANCE, MAX_MISS = 0.1, 0.3  # m, below the log's lowest point and along the log
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
@@ -130,16 +126,14 @@ def load_model(
     contact: str = "primitive",
     integrator: str = "implicitfast",
     solver: str = "Newton",
-    sdf_initpoints: int = 16,
-    sdf_iterations: int = 5,
-    visual: bool = True,
+    sdf_initpoints: int = 16,  # starts of each search for contacts by "sdf"
+    sdf_iterations: int = 5,  # gradient steps from each start
+    visual: bool = True,  # without, nothing is left that is only drawn: the same motion, sooner
 ) -> mujoco.MjModel:
     """Compile assets/crane.xml.
 
     contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
-    jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B), with
-    sdf_initpoints starts and sdf_iterations gradient steps of each search for contacts. Without
-    visual nothing is left that is only drawn: the same motion, sooner (assets/README.md).
+    jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B).
     """
     _choice("contact", contact, ("primitive", "sdf"))
     _choice("integrator", integrator, ("implicitfast", "implicit", "discrete", "Euler"))
@@ -150,15 +144,13 @@ def load_model(
     spec.option.sdf_initpoints = _count("sdf_initpoints", sdf_initpoints)
     spec.option.sdf_iterations = _count("sdf_iterations", sdf_iterations)
     if contact == "sdf":
-        log_bit = spec.geom("log_capsule").contype
+        # 4: the log; 8, which nothing touches: without a bit discardvisual would take the capsule
+        spec.geom("log").contype, spec.geom("log_capsule").contype = 4, 8
         for geom in spec.geoms:
-            if geom.classname.name == "jaw_collision":
-                geom.conaffinity &= ~log_bit
-            elif geom.classname.name == "jaw_mesh":
-                geom.type = mujoco.mjtGeom.mjGEOM_SDF
-                geom.conaffinity = log_bit
-        # 8, which nothing touches: without a bit discardvisual would take the capsule
-        spec.geom("log").contype, spec.geom("log_capsule").contype = log_bit, 8
+            if geom.classname.name == "jaw_mesh":
+                geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_SDF, 4
+            elif geom.classname.name == "jaw_collision":
+                geom.conaffinity &= ~4
     spec.compiler.discardvisual = not visual
     return spec.compile()
 
@@ -200,11 +192,10 @@ def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array,
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
     """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
 
-    Paper: Eqs. (relative distance) and (angle distance), with d_off = (d_max - d) / 2 from the
-    log's diameter d (README, errata), which offset "plus" adds and "minus" subtracts. The signed
-    angle turns the grapple's axis into the log's, a line without direction: the shorter turn, or
-    the other one where the shorter would take the rotator beyond ROTATOR_MAX. A hanging grapple's
-    yaw is that of q1 - q7.
+    Paper: Eqs. (relative distance) and (angle distance). offset "plus" adds d_off = (d_max - d) / 2
+    of the log's diameter d, "minus" subtracts it (README, errata). The signed angle turns the
+    grapple's axis into the log's, a line without direction: the shorter turn, or the other one
+    where the shorter would take the rotator beyond ROTATOR_MAX. Hanging, the yaw is q1 - q7's.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
@@ -222,9 +213,9 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
 
 def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
     """Pose measurement errors of Sec. IV-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
-    decay = np.sum(delta_p**2, axis=-1) / POSE_RANGE**2  # s(Delta_p)
-    noisy_delta_p = delta_p * (1 + epsilon[:, :1] * decay[:, None])
-    return noisy_delta_p, angle * (1 + epsilon[:, 1] * decay)
+    decay = np.sum(delta_p**2, axis=-1, keepdims=True) / POSE_RANGE**2  # s(Delta_p)
+    factor = 1 + epsilon * decay
+    return delta_p * factor[:, :1], angle * factor[:, 1]
 
 
 def log_clearance(state: CraneState) -> Array:
@@ -240,36 +231,29 @@ def centre_miss(state: CraneState) -> Array:
 
 
 def reward_terms(
-    state: CraneState,
-    d_combine: Array,
-    command: Array,
-    kind: str = "staged",
-    omega2: float = 1.0,
+    state: CraneState, d_combine: Array, command: Array, kind: str = "staged", omega2: float = 1.0
 ) -> Array:
     """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
 
     d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, command (N, 6) the commanded velocities in
-    rad/s and m/s. kind "paper" is Sec. III-A2 as printed. In "staged" r_grapple and r_lift count
-    only near the log's centre, r_balance only while it is lifted and both jaws touch it, whatever
-    is commanded to them. Why: README, errata.
+    rad/s and m/s. kind "paper" is Sec. III-A2 as printed. "staged" (why: README, errata) pays
+    r_grapple and r_lift near the log's centre, r_balance while both jaws hold it off the ground.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
     if kind == "paper":
-        calm = 1 - np.tanh(np.linalg.norm(command, axis=-1))
         r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
         height_error = np.abs(state.log_centre[:, 2] - DESIRED_HEIGHT)
         r_lift = (1 - np.tanh(height_error)) * (1 - r_grapple)
-        r_balance = calm * (1 - r_lift)
+        r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
     else:
         near = np.minimum(1, np.exp(-3 * omega2 * (d_combine - REACH_DISTANCE)))
         off_centre = (centre_miss(state) / CENTRED) ** 2
         r_grapple = 2 * near * np.exp(-off_centre / 4) * closed
         clearance = np.maximum(log_clearance(state), 1e-9)  # 0 on the ground; best is 1 m
         lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
-        calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))
-        held = state.touching.all(axis=-1)
-        r_lift, r_balance = 2 * lift, 3 * calm * held * lift
+        calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
+        r_lift, r_balance = 2 * lift, 3 * calm * state.touching.all(axis=-1) * lift
     return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
 
 
@@ -294,14 +278,11 @@ def termination_rule(
     return np.array([*TERMINATIONS, "none"])[np.argmax(rules, axis=0)]
 
 
-def success_conditions(
-    reached: Array, clearance: Array, touching: Array, miss: Array
-) -> dict[str, Array]:
+def success_conditions(reached: Array, clearance: Array, touching: Array, miss: Array) -> dict:
     """The one definition of success, for training, evaluation and tests: (N,) bool each.
 
-    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. The others hold the W
-    decisions of the last HOLD_TIME of an episode that lasted TIME_LIMIT: clearance and miss (N, W)
-    in m, touching (N, W, 2).
+    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. clearance and miss (N, W)
+    in m, touching (N, W, 2): at the W decisions of the last HOLD_TIME of a whole episode.
     """
     failed = {
         "not_reached": ~reached,
@@ -326,19 +307,7 @@ def monte_carlo_trials(
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`; SAME_STEP autoreset.
 
-    num_envs: N. env_threads: physics threads, 0 for all cores. frame_skip: physics steps of 5 ms
-    per decision, 20 is 10 Hz, 1 the paper's protocol. speed: command limits, a key of SPEEDS.
-    reward: "staged" or "paper", with omega2 (1/m).
-    offset, signed_yaw: see `relative_pose`. axes of the observed Delta_p: "world", or "crane", x
-    out along the boom and y to its left, which turn with q1. pose_noise: "none", "step" (drawn at
-    every decision) or "episode" (drawn once); it touches the observation only.
-    diameter: None draws it, a number or (N,) numbers in m fix it. difficulty: see `sample_start`;
-    may be assigned at any time and holds from the next new start on. retry: for training, share of
-    episodes that start as one of the crane's last four failures did, repeated ones included.
-    model_options: arguments of `load_model`; visual only with a render_mode where not given.
-
-    Crane i's starts depend on the seed and i alone, with retry on its own failures too, but not on
-    N or the number of threads.
+    Crane i's starts depend on the seed, on i and, with retry, on its failures; not on N or threads.
 
     `info` describes the step just made, for every crane, also one that ended with it:
     `termination` (of TERMINATIONS, or "none"), the terms r_distance, r_grapple, r_lift, r_balance,
@@ -352,24 +321,24 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def __init__(
         self,
-        num_envs: int = 1,
-        frame_skip: int = 20,
-        reward: str = "staged",
-        speed: str = "real",
-        offset: str = "plus",
-        signed_yaw: bool = False,
-        axes: str = "world",
-        pose_noise: str = "none",
-        diameter: float | Array | None = None,
-        difficulty: float = 1.0,
-        retry: float = 0.0,
-        omega2: float = 1.0,
-        env_threads: int = 0,
-        render_mode: str | None = None,
-        camera: str = "overview",
+        num_envs: int = 1,  # N
+        frame_skip: int = 20,  # physics steps of 5 ms per decision: 10 Hz; 1 is the paper's
+        reward: str = "staged",  # or "paper", see `reward_terms`
+        speed: str = "real",  # command limits, a key of SPEEDS
+        offset: str = "plus",  # or "minus", see `relative_pose`
+        signed_yaw: bool = False,  # observe the signed angle, see `relative_pose`
+        axes: str = "world",  # of the observed Delta_p; "crane": x along the boom, y to its left
+        pose_noise: str = "none",  # of the observation; "step" at every decision, "episode" once
+        diameter: float | Array | None = None,  # one or (N,), m; None draws it
+        difficulty: float = 1.0,  # see `sample_start`; may be assigned, for new starts from then on
+        retry: float = 0.0,  # share of starts that repeat one of the crane's last 4 failures
+        omega2: float = 1.0,  # of the reward, 1/m
+        env_threads: int = 0,  # physics threads, 0 for all cores
+        render_mode: str | None = None,  # or "human", "rgb_array"
+        camera: str = "overview",  # or "side", "grapple"
         width: int = 640,
         height: int = 480,
-        **model_options: Any,
+        **model_options: Any,  # of `load_model`; visual only with a render_mode where not given
     ):
         _choice("reward", reward, ("staged", "paper"))
         _choice("speed", speed, tuple(SPEEDS))
@@ -378,67 +347,60 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         _choice("pose_noise", pose_noise, ("none", "step", "episode"))
         _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         _choice("camera", camera, ("overview", "side", "grapple"))
-        self.num_envs = _count("num_envs", num_envs)
-        self.frame_skip = _count("frame_skip", frame_skip)
-        self.reward, self.offset, self.signed_yaw = reward, offset, signed_yaw
-        self.speed, self.axes, self.pose_noise = SPEEDS[speed], axes, pose_noise
-        self.omega2 = omega2
         for name, share in (("difficulty", difficulty), ("retry", retry)):
             if not 0 <= share <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {share}")
-        self.difficulty, self.retry = difficulty, retry
-        self.fixed_diameter = None
+        self.num_envs = _count("num_envs", num_envs)
+        self.frame_skip = _count("frame_skip", frame_skip)
         if diameter is not None:
             d = np.asarray(diameter, float)
             if d.shape not in [(), (self.num_envs,)] or not np.all((D_MIN <= d) & (d <= D_MAX)):
                 needed = f"one number or {self.num_envs} numbers in [{D_MIN}, {D_MAX}] m"
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
-            self.fixed_diameter = np.broadcast_to(d, self.num_envs)
+            diameter = np.broadcast_to(d, self.num_envs)
+        self.reward, self.omega2, self.offset, self.signed_yaw = reward, omega2, offset, signed_yaw
+        self.speed, self.axes, self.pose_noise = SPEEDS[speed], axes, pose_noise
+        self.difficulty, self.retry, self.fixed_diameter = difficulty, retry, diameter
+        self.render_mode, self.camera, self._frame_size = render_mode, camera, (height, width)
+        self.viewer = None  # the window, or the renderer of "rgb_array"
 
         self.model = model = load_model(**{"visual": render_mode is not None, **model_options})
         self.batch = batch = Batch(model, self.num_envs, env_threads, persistent=True)
-        # live views of the engine's arrays, and where in them our joints are
-        self._qpos, self._qvel, self._act = map(batch.bind, ("qpos", "qvel", "act"))
-        self._ctrl, self._sensordata = map(batch.bind, ("ctrl", "sensordata"))
-        self._qfrc_bias = batch.bind("qfrc_bias")
         for field in ("geom_size", "body_mass", "body_inertia"):
             batch.expand(field)  # each crane has a log of its own
+        # live views of the engine's arrays, and where in them our joints are
+        views = map(batch.bind, ("qpos", "qvel", "act", "ctrl", "qfrc_bias", "sensordata"))
+        self._qpos, self._qvel, self._act, self._ctrl, self._bias, self._sensors = views
+        self._log_size = batch.geom("log").size
         joints = [model.joint(name).id for name in JOINTS]
         servos = [model.joint(name).id for name in SERVOS]
-        integrals = [model.actuator(f"{name}_integral").id for name in SERVOS]
         self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
         self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
         self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
-        self._servo_kp = model.actuator_gainprm[integrals, 0]
+        self._servo_kp = model.actuator_gainprm[8:, 0]  # of the integrators, behind 8 velocities
         self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
 
         self.dt = self.frame_skip * TIMESTEP
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
         window = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
-        self._diameter = np.full(self.num_envs, (D_MIN + D_MAX) / 2)
+        draws = self.max_decisions + 1 if pose_noise == "step" else 1
         self._decisions = np.zeros(self.num_envs, int)
         self._reach_time = np.full(self.num_envs, np.inf)
         self._window = np.zeros((self.num_envs, window, 4))  # clearance, touching (2), miss
-        self._noise = np.zeros((self.num_envs, self.max_decisions + 1, 2))
+        self._noise = np.zeros((self.num_envs, draws, 2))  # epsilon; "none" never reads it
         self._rngs: list[tuple[Generator, Generator]] | None = None
         self._starts: list[tuple] = [()] * self.num_envs
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
-        bound = np.concatenate([np.full(6, 10.0), np.full(3, 20.0), [1.5 * np.pi]])
+        bound = np.repeat([10.0, 20.0, 1.5 * np.pi], [6, 3, 1])  # dq, Delta_p, its angle
         bounds = np.float32([[*low, *-bound], [*high, *bound]])
         self.single_observation_space = gymnasium.spaces.Box(*bounds)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-
-        self.render_mode, self.camera = render_mode, camera
-        self._frame_size = (height, width)
-        self._renderer = self.viewer = self._scene = None
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
-    def reset(
-        self, *, seed: int | Sequence[int | SeedSequence] | None = None, options: dict | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self._rngs is None:
@@ -450,8 +412,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             # starts and pose noise have streams of their own: noise leaves the starts as they are
             self._rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
             self._failures = [deque(maxlen=4) for _ in seeds]
-        self._start_episodes(np.arange(self.num_envs))
-        return self._observe(self._state(), np.zeros((self.num_envs, 6)))
+        return self._start_episodes(np.arange(self.num_envs))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
@@ -464,8 +425,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             for i in ended:
                 info["final_obs"][i] = obs[i].copy()
             info["_final_obs"] = info["_final_info"] = done
-            self._start_episodes(ended)
-            starts, _ = self._observe(self._state(), np.zeros((self.num_envs, 6)))
+            starts, _ = self._start_episodes(ended)
             obs[ended] = starts[ended]
         return obs, reward, terminated, truncated, info
 
@@ -483,14 +443,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diverged = self._simulate(command[:, COMMAND_OF_SERVO])
         self._decisions += 1
 
-        state = self._state()
-        time = self._decisions * self.dt
+        state, time = self._state(), self._decisions * self.dt
         obs, info = self._observe(state, command)
-        reach = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
-        self._reach_time = np.where(reach, np.minimum(self._reach_time, time), self._reach_time)
+        near = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
+        self._reach_time = np.minimum(self._reach_time, np.where(near, time, np.inf))
         reached = np.isfinite(self._reach_time)
-        now = np.column_stack([info["clearance"], state.touching, info["centre_miss"]])
         slot = self._decisions % self._window.shape[1]
+        now = np.column_stack([info["clearance"], state.touching, info["centre_miss"]])
         self._window[np.arange(self.num_envs), slot] = now
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
@@ -499,12 +458,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         w = self._window
         conditions = success_conditions(reached, w[..., 0], w[..., 1:3] > 0, w[..., 3])
         conditions["success"] &= truncated
-        info |= conditions | {"termination": ending, "time_to_reach": self._reach_time}
+        info |= conditions | {"termination": ending, "time_to_reach": self._reach_time.copy()}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
-        reward = np.where(diverged, 0.0, reward)
         for i in np.flatnonzero((ending != "none") & ~info["success"]):
             self._failures[i].append(self._starts[i])
-        return obs, reward, terminated, truncated, info
+        return obs, np.where(diverged, 0.0, reward), terminated, truncated, info
 
     def _simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
@@ -520,32 +478,28 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 self.batch.step(nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)
             except SimulationError as error:
                 failed[error.ids] = True
-        warned = self.batch.warning[:, :, 1].any(axis=-1)
         finite = np.isfinite(self._qpos).all(axis=-1) & np.isfinite(self._qvel).all(axis=-1)
-        return failed | warned | ~finite
+        return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
 
-    def _start_episodes(self, ids: Array) -> None:
+    def _start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
+        """New episodes in cranes `ids`, and what all cranes observe then."""
         for i in ids:
             (start_rng, noise_rng), failures = self._rngs[i], self._failures[i]
             if self.retry and failures and start_rng.random() < self.retry:
                 self._starts[i] = failures[start_rng.integers(len(failures))]
             else:
                 self._starts[i] = sample_start(start_rng, self.difficulty)
-            if self.pose_noise != "none":
-                draws = 1 if self.pose_noise == "episode" else self.max_decisions + 1
-                self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, size=(draws, 2))
-        q, log_pose, diameter = (
-            np.array(column) for column in zip(*[self._starts[i] for i in ids])
-        )
+            self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self._noise[i].shape)
+        q, log_pose, diameter = map(np.array, zip(*[self._starts[i] for i in ids]))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
+        return self._observe(self._state(), np.zeros((self.num_envs, 6)))
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        radius = diameter / 2
-        x, y, yaw = log_pose.T
+        radius, (x, y, yaw) = diameter / 2, log_pose.T
         # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
         self.batch.joint("log").qpos[ids] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
@@ -555,7 +509,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
         log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
-        self.batch.geom("log").size[ids, 0] = capsule.size[ids, 0] = radius
+        self._log_size[ids, 0] = capsule.size[ids, 0] = radius
         capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
         log.mass[ids, 0] = mass
         log.inertia[ids] = np.stack([across, across, along], axis=-1)
@@ -563,25 +517,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         # the integrators start with the static load, so that an idle crane neither sags nor swings
-        load = self._qfrc_bias[np.ix_(ids, self._servo_dq)]
+        load = self._bias[np.ix_(ids, self._servo_dq)]
         self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load / self._servo_kp
-        self._diameter[ids] = diameter
         self._decisions[ids] = 0
-        self._reach_time = self._reach_time.copy()  # earlier infos keep theirs
         self._reach_time[ids] = np.inf
 
     def _state(self) -> CraneState:
-        s = self._sensordata.copy()  # order of the sensors in crane.xml
-        return CraneState(
-            q=self._qpos[:, self._q],
-            dq=self._qvel[:, self._dq],
-            grapple_centre=s[:, 0:3],
-            grapple_axis=s[:, 3:6],
-            log_centre=s[:, 6:9],
-            log_axis=s[:, 9:12],
-            touching=s[:, 12:14] > 0,
-            diameter=self._diameter.copy(),
-        )
+        # CraneState has the order of the sensors in crane.xml
+        *vectors, touch = np.split(self._sensors.copy(), [3, 6, 9, 12], axis=-1)
+        q, dq, diameter = self._qpos[:, self._q], self._qvel[:, self._dq], 2 * self._log_size[:, 0]
+        return CraneState(q, dq, *vectors, touch > 0, diameter)
 
     def _observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
         """Observations (N, 18), float32, inside the observation space; what `info` says of them."""
@@ -593,9 +538,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info["centre_miss"] = centre_miss(state)
         angle = signed_angle if self.signed_yaw else delta_psi
         if self.pose_noise != "none":
-            now = np.minimum(self._decisions, self.max_decisions)
-            epsilon = self._noise[np.arange(self.num_envs), now]
-            delta_p, angle = noisy_pose(delta_p, angle, epsilon)
+            now = np.minimum(self._decisions, self._noise.shape[1] - 1)
+            delta_p, angle = noisy_pose(delta_p, angle, self._noise[np.arange(len(now)), now])
         if self.axes == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
@@ -605,34 +549,29 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
-        if self._scene is None:
-            self._scene = self.batch.get_model(0), self.batch.get_data(0)  # the window keeps them
-        model, data = self._scene
         if self.render_mode == "rgb_array":
-            if self._renderer is None:
-                self._renderer = mujoco.Renderer(model, *self._frame_size)
+            if self.viewer is None:
+                self.viewer = mujoco.Renderer(self.batch.get_model(0), *self._frame_size)
             frames = []
             for i in range(self.num_envs):
-                self.batch.get_model(i, model)
-                self.batch.get_data(i, data)
-                self._renderer.update_scene(data, self.camera)
-                frames.append(self._renderer.render())
+                self.batch.get_model(i, self.viewer.model)
+                self.viewer.update_scene(self.batch.get_data(i), self.camera)
+                frames.append(self.viewer.render())
             return tuple(frames)
         if self.render_mode == "human":
             from mujoco import viewer  # needs a display's libraries
 
             if self.viewer is None:
-                self.viewer = viewer.launch_passive(model, data)
+                self.viewer = viewer.launch_passive(self.batch.get_model(0), self.batch.get_data(0))
             with self.viewer.lock():
-                self.batch.get_model(0, model)
-                self.batch.get_data(0, data)
+                self.batch.get_model(0, self.viewer.m)
+                self.batch.get_data(0, self.viewer.d)
             self.viewer.sync()
 
     def close_extras(self, **kwargs: Any) -> None:
-        for window in (self._renderer, self.viewer):
-            if window is not None:
-                window.close()
-        self._renderer = self.viewer = None
+        if self.viewer is not None:
+            self.viewer.close()
+        self.viewer = None
 
 
 class CraneEnv(gymnasium.Env):

@@ -225,7 +225,7 @@ def test_the_world_starts_as_sampled():
         np.testing.assert_allclose(state.q[i], q)
         np.testing.assert_allclose(state.log_centre[i], [x, y, diameter / 2], atol=1e-12)
         np.testing.assert_allclose(state.log_axis[i], [-np.sin(yaw), np.cos(yaw), 0], atol=1e-12)
-        np.testing.assert_allclose(envs._diameter[i], diameter)
+        np.testing.assert_allclose(state.diameter[i], diameter)
     assert np.abs(state.dq).max() == 0
     assert not envs._state().touching.any()
 
@@ -298,7 +298,7 @@ def test_difficulty():
     delta_p, delta_psi, _ = crane_env.relative_pose(state)
     assert delta_psi.max() < 1e-2  # aligned but for the swing
     easy = np.linalg.norm(delta_p[:, :2], axis=-1)
-    np.testing.assert_allclose(envs._diameter, 0.55)
+    np.testing.assert_allclose(state.diameter, 0.55)
     envs.difficulty = 1.0
     envs.reset(seed=0)
     delta_p, _, _ = crane_env.relative_pose(envs._state())
