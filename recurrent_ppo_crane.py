@@ -62,7 +62,7 @@ class Args:
     seed: int = 1  # seed of network, policy samples and episodes
     total_timesteps: int = 1_024_000  # decisions to train for, over all cranes, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 2  # CPU threads of an update; results are the same for equal numbers
+    torch_threads: int = 1  # CPU threads of an update, whose LSTM steps are too small for two
     resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
