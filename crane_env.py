@@ -126,7 +126,7 @@ def load_model(
     contact: str = "primitive",
     integrator: str = "implicitfast",
     solver: str = "Newton",
-    sdf_initpoints: int = 16,  # starts of each search for contacts by "sdf"
+    sdf_initpoints: int = 8,  # starts of each search for contacts by "sdf"
     sdf_iterations: int = 5,  # gradient steps from each start
     visual: bool = True,  # without, nothing is left that is only drawn: the same motion, sooner
 ) -> mujoco.MjModel:

@@ -1,9 +1,12 @@
-"""Writes the two jaw meshes, assets/jaw_outer.obj and assets/jaw_inner.obj.
+"""Writes the meshes of the jaws, assets/jaw_root.obj, jaw_middle.obj and jaw_tip.obj.
 
 A jaw is a band bent to an arc between its pivot (the origin) and its tip (CHORD, 0, 0); the arc
 bulges by SAGITTA towards -y, away from the log. The outer jaw has two bands with a gap, through
-which the inner jaw's single band passes when the grapple closes on a thin log. The script also
-prints the capsule chain of crane.xml, whose straight segments straddle the arc.
+which the inner jaw's single band passes when the grapple closes on a thin log; crane.xml scales the
+meshes, 1 m wide, to each band's width. A band comes in PIECES, the shorter the nearer to the tip,
+which holds the log: SDF contacts are searched for in the box that a piece shares with the log, and
+the smaller the box, the fewer are missed (assets/README.md). The script also prints the capsule
+chain of crane.xml, whose straight segments straddle the arc.
 
     python assets/make_meshes.py
 """
@@ -16,9 +19,8 @@ import tyro
 CHORD = 0.8566  # m, pivot to tip
 SAGITTA = 0.30  # m
 THICKNESS = 0.05  # m, measured along the arc's radius
-OUTER_BANDS = [(-0.190, -0.105), (0.105, 0.190)]  # m, along the hinge axis z
-INNER_BANDS = [(-0.100, 0.100)]
-SECTIONS = 48  # of the mesh along the arc
+SECTIONS = 48  # of the meshes along the arc
+PIECES = {"root": (0, 32), "middle": (32, 44), "tip": (44, 48)}  # sections of each
 SEGMENTS = 5  # of the capsule chain
 
 RADIUS = (CHORD**2 / 4 + SAGITTA**2) / (2 * SAGITTA)
@@ -32,41 +34,28 @@ def arc(radius: float, sections: int) -> np.ndarray:
     return centre + radius * np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
 
 
-def band(low: float, high: float, first_vertex: int) -> tuple[list[str], list[str]]:
-    """OBJ lines (vertices, faces) of a closed bent band between z = low and z = high."""
+def piece(first: int, last: int) -> str:
+    """OBJ text of the closed band between two of the arc's sections, z from -0.5 to 0.5 m."""
     inside, outside = arc(RADIUS - THICKNESS / 2, SECTIONS), arc(RADIUS + THICKNESS / 2, SECTIONS)
-    vertices = []
-    for i in range(SECTIONS + 1):
-        for (x, y), z in zip(
-            [inside[i], inside[i], outside[i], outside[i]], [low, high, high, low]
-        ):
-            vertices.append(f"v {x:.5f} {y:.5f} {z:.5f}")
-    quads = [(0, 1, 2, 3)]  # the cap at the pivot, then the sides, then the cap at the tip
-    for i in range(SECTIONS):
-        ring, following = 4 * i, 4 * (i + 1)
+    lines = ["# written by make_meshes.py"]
+    for i in range(first, last + 1):
+        corners = [(*inside[i], -0.5), (*inside[i], 0.5), (*outside[i], 0.5), (*outside[i], -0.5)]
+        lines += [f"v {x:.5f} {y:.5f} {z:.1f}" for x, y, z in corners]
+    quads = [(0, 1, 2, 3)]  # the cap towards the pivot, then the sides, then the cap at the end
+    for ring in range(0, 4 * (last - first), 4):
         for k in range(4):
-            quads.append((ring + k, following + k, following + (k + 1) % 4, ring + (k + 1) % 4))
-    last = 4 * SECTIONS
-    quads.append((last + 3, last + 2, last + 1, last))
-    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return vertices, [
-        f"f {a + first_vertex} {c + first_vertex} {b + first_vertex}" for a, b, c in triangles
-    ]
-
-
-def write_jaw(path: Path, bands: list[tuple[float, float]]) -> None:
-    vertices, faces = [], []
-    for low, high in bands:
-        new_vertices, new_faces = band(low, high, len(vertices) + 1)
-        vertices += new_vertices
-        faces += new_faces
-    path.write_text("\n".join(["# written by make_meshes.py", *vertices, *faces]) + "\n")
+            quads.append((ring + k, ring + 4 + k, ring + 4 + (k + 1) % 4, ring + (k + 1) % 4))
+    end = 4 * (last - first)
+    quads.append((end + 3, end + 2, end + 1, end))
+    for a, b, c, d in quads:
+        lines += [f"f {a + 1} {c + 1} {b + 1}", f"f {a + 1} {d + 1} {c + 1}"]
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
     here = Path(__file__).parent
-    write_jaw(here / "jaw_outer.obj", OUTER_BANDS)
-    write_jaw(here / "jaw_inner.obj", INNER_BANDS)
+    for name, (first, last) in PIECES.items():
+        (here / f"jaw_{name}.obj").write_text(piece(first, last))
     # A chord lies inside its arc: moved out by half its sagitta, it misses by as much both ways.
     chord_sagitta = RADIUS * (1 - np.cos(HALF_ANGLE / SEGMENTS))
     nodes = arc(RADIUS + chord_sagitta / 2, SEGMENTS)
