@@ -70,18 +70,22 @@ MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 REVISION = 6  # of the task; raise it when a change spoils policies or checkpoints
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators
-LOG_LENGTH, LOG_DENSITY = 2.75, 650.0  # m, kg/m^3
+LOG_LENGTH = 2.75  # m
+LOG_DENSITY = 650.0  # kg/m^3
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
 POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
 POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
-TIME_LIMIT, HOLD_TIME = 9.0, 0.5  # s, an episode, and its end in which the log must be held
-REACH_TIME, REACH_DISTANCE = 6.0, 0.35  # s, m: by then d_combine must have been below this
+TIME_LIMIT = 9.0  # s, of an episode
+HOLD_TIME = 0.5  # s at its end, in which the log must be held
+REACH_TIME = 6.0  # s: by then
+REACH_DISTANCE = 0.35  # m: d_combine must have been below this
 LOG_RANGE = 8.0  # m, between grapple centre and log centre
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
-MIN_CLEARANCE, MAX_MISS = 0.1, 0.3  # m, below the log's lowest point and along the log
+MIN_CLEARANCE = 0.1  # m below the log's lowest point
+MAX_MISS = 0.3  # m along the log
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
@@ -144,7 +148,8 @@ def load_model(
     spec.option.sdf_initpoints = _count("sdf_initpoints", sdf_initpoints)
     spec.option.sdf_iterations = _count("sdf_iterations", sdf_iterations)
     if contact == "sdf":
-        # 4: the log; 8, which nothing touches: without a bit discardvisual would take the capsule
+        # Collision bits of crane.xml: 4 is the log's. 8 collides with nothing, but a geom without
+        # any bit counts as only drawn.
         spec.geom("log").contype, spec.geom("log_capsule").contype = 4, 8
         for geom in spec.geoms:
             if geom.classname.name == "jaw_mesh":
@@ -195,7 +200,7 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     Paper: Eqs. (relative distance) and (angle distance). offset "plus" adds d_off = (d_max - d) / 2
     of the log's diameter d, "minus" subtracts it (README, errata). The signed angle turns the
     grapple's axis into the log's, a line without direction: the shorter turn, or the other one
-    where the shorter would take the rotator beyond ROTATOR_MAX. Hanging, the yaw is q1 - q7's.
+    where the shorter would take the rotator beyond ROTATOR_MAX. A hanging grapple's yaw is q1 - q7.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
@@ -253,7 +258,8 @@ def reward_terms(
         clearance = np.maximum(log_clearance(state), 1e-9)  # 0 on the ground; best is 1 m
         lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
-        r_lift, r_balance = 2 * lift, 3 * calm * state.touching.all(axis=-1) * lift
+        held = state.touching.all(axis=-1)
+        r_lift, r_balance = 2 * lift, 3 * calm * held * lift
     return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
 
 
@@ -523,10 +529,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._reach_time[ids] = np.inf
 
     def _state(self) -> CraneState:
-        # CraneState has the order of the sensors in crane.xml
-        *vectors, touch = np.split(self._sensors.copy(), [3, 6, 9, 12], axis=-1)
+        # in the order of the sensors in crane.xml
+        centre, axis, log_centre, log_axis, touch = np.split(
+            self._sensors.copy(), [3, 6, 9, 12], axis=-1
+        )
         q, dq, diameter = self._qpos[:, self._q], self._qvel[:, self._dq], 2 * self._log_size[:, 0]
-        return CraneState(q, dq, *vectors, touch > 0, diameter)
+        return CraneState(q, dq, centre, axis, log_centre, log_axis, touch > 0, diameter)
 
     def _observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
         """Observations (N, 18), float32, inside the observation space; what `info` says of them."""

@@ -130,6 +130,7 @@ LEAST = {  # the smallest values of arguments that have one
 }
 
 # What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
+# F is that of the whole rollout.
 PAPER = """
 --paper --total-timesteps 500_000_000 --num-envs 42 --frame-skip 1 --contact sdf --reward paper
 --offset minus --no-signed-yaw --axes world --integrator implicit --solver CG --num-steps 1000
@@ -267,7 +268,7 @@ def line_search(
     """
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
     start = flat(agent.policy_parameters())
-    trial = deepcopy(agent)  # the agent stays whole, also where Ctrl-C comes in between
+    trial = deepcopy(agent)  # trials leave the agent alone, also where Ctrl-C stops one
     for k in range(args.line_search_steps):
         fraction = args.line_search_decay**k
         nn.utils.vector_to_parameters(start + fraction * full_step, trial.policy_parameters())
@@ -278,21 +279,14 @@ def line_search(
     return 0.0, 0.0, 0.0
 
 
-def bootstrap_values(
-    values: Tensor, last_value: Tensor, terminal: Tensor, cut_at: list, cut_values: Tensor | None
-) -> Tensor:
-    """V(s_{t+1}), (T, N): cut_values where the time limit cut, 0 where an episode terminated."""
-    next_values = torch.cat([values[1:], last_value[None]])
-    if cut_at:
-        steps, cranes = zip(*cut_at)
-        next_values[steps, cranes] = cut_values
-    return next_values * (1 - terminal)
-
-
 def compute_gae(
-    rewards: Tensor, values: Tensor, next_values: Tensor, dones: Tensor, gamma: float, lam: float
+    rewards: Tensor, values: Tensor, last_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values, `bootstrap_values` and episode ends, all (T, N)."""
+    """Advantages (T, N) from rewards, values and episode ends (T, N), and what follows them (N,).
+
+    Nothing follows an end; gamma V(final_obs) of one by the time limit is part of its reward.
+    """
+    next_values = torch.cat([values[1:], last_value[None]]) * (1 - dones)
     advantages = torch.zeros_like(rewards)
     last = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
@@ -360,14 +354,16 @@ if __name__ == "__main__":
     if args.resume is not None:
         try:
             checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
-            made_by = checkpoint["algorithm"], checkpoint["task"], "optimizer" in checkpoint
-            if made_by != (ALGORITHM, crane_env.REVISION, True):
-                raise ValueError("of another algorithm or revision, or a policy.pt")
-            machine = {name: getattr(args, name) for name in MACHINE_ARGS}
-            args = Args(**checkpoint["args"] | machine)
-        except Exception as error:
-            needed = f"--resume needs a checkpoint.pt of {ALGORITHM}, got {args.resume}"
-            raise SystemExit(f"{needed}: {error}") from None
+            saved, task = checkpoint["args"], checkpoint["task"]
+            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
+            ours &= task == crane_env.REVISION and saved.keys() == asdict(args).keys()
+        except OSError as error:
+            raise SystemExit(f"--resume: {error}") from None
+        except Exception:  # whatever a file that is no checkpoint may raise
+            ours = False
+        if not ours:
+            raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of today's {ALGORITHM}")
+        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
         print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
     elif args.paper:
         print(PAPER_GUESSES)
@@ -394,7 +390,8 @@ if __name__ == "__main__":
         raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
 
     try:
-        envs = RecordEpisodeStatistics(make_envs(args, args.num_envs, retry=args.retry), 200)
+        envs = make_envs(args, args.num_envs, retry=args.retry)
+        envs = RecordEpisodeStatistics(envs, buffer_length=200)  # info["episode"], return_queue
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -447,7 +444,6 @@ if __name__ == "__main__":
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards = torch.zeros((args.num_steps, args.num_envs), device=device)
     dones = torch.zeros((args.num_steps, args.num_envs), device=device)
-    terminations = torch.zeros((args.num_steps, args.num_envs), device=device)
 
     if is_crane(args):
         envs.unwrapped.difficulty = difficulty
@@ -490,8 +486,6 @@ if __name__ == "__main__":
                 done = terminated | truncated
                 rewards[step] = torch.as_tensor(reward * reward_scale, device=device)
                 dones[step] = torch.as_tensor(done, device=device)
-                worthless = terminated if args.bootstrap else done  # V(s_{t+1}) is 0
-                terminations[step] = torch.as_tensor(worthless, device=device)
 
                 for i in np.flatnonzero(done):
                     if truncated[i] and not terminated[i]:
@@ -514,11 +508,11 @@ if __name__ == "__main__":
             with torch.no_grad():
                 b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
                 values = agent.get_value(b_obs).view_as(rewards)
-                last_value, cut_values = agent.get_value(agent.normalize(next_obs)), None
-                if cut_at:
+                last_value = agent.get_value(agent.normalize(next_obs))
+                if cut_at and args.bootstrap:
                     cut_values = agent.get_value(torch.stack(cut_obs))
-                next_values = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
-                advantages = compute_gae(rewards, values, next_values, dones, gamma, gae_lambda)
+                    rewards[tuple(zip(*cut_at))] += gamma * cut_values
+                advantages = compute_gae(rewards, values, last_value, dones, gamma, gae_lambda)
                 returns = advantages + values
             b_advantages, b_returns = advantages.flatten(), returns.flatten()
 
@@ -597,8 +591,8 @@ if __name__ == "__main__":
                         recent_success.clear()
             for name, value in report.items():
                 writer.add_scalar(name, value, global_step)
-            shown = {"return": envs.return_queue, "success": recent_success}
-            shown = {name: np.mean(recent) for name, recent in shown.items() if recent}
+            recent = {"return": envs.return_queue, "success": recent_success}
+            shown = {name: np.mean(values) for name, values in recent.items() if values}
             progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
             if args.paper and iteration == first_iteration:
                 progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")

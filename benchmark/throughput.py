@@ -16,7 +16,8 @@ Last come the ratios that matter, each with a bar to pass and an aim.
 - training: iterations of our scripts and of SB3, from the second on, with the same network,
   rollout, epochs and minibatch, TRPO's conjugate gradient over 1,024 decisions. SB3 has its fastest
   arrangement of environments, RecurrentPPO also 64 at once, the better of 1 and 2 threads, no
-  monitor and no normalised observations; ours have 2 threads, all epochs and else their defaults.
+  monitor and no normalised observations; ours have their default threads, all epochs, and else
+  their defaults.
   It is the start of a training: no crane holds a log yet. "update" is what follows the rollout;
   ours contains values, log-probabilities and advantages, which SB3 computes before.
 """
@@ -265,7 +266,8 @@ def resident_mb(num_envs: int) -> float:
 def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, float]:
     """Iterations 2 to 4 of one of our scripts, and its peak memory in MB."""
     rollout = CRANES * num_steps
-    flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": THREADS}
+    threads = eval_crane.ALGORITHMS[script].Args().torch_threads
+    flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": threads}
     flags |= {"frame-skip": frame_skip, "num-steps": num_steps, "update-epochs": EPOCHS}
     flags |= {"total-timesteps": 4 * rollout, "eval-every": 0, "final-trials": 0}
     if script == "recurrent_ppo":
@@ -291,7 +293,7 @@ def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, 
     updates = events.Scalars("time/update")
     seconds = np.diff([event.wall_time for event in updates])
     values = [event.value for event in updates[1:]]
-    return Training((rollout / seconds).tolist(), values, THREADS), peak
+    return Training((rollout / seconds).tolist(), values, threads), peak
 
 
 def measure_training(results: Results, num_steps: int, bar: tqdm) -> None:

@@ -156,13 +156,16 @@ def test_same_step_autoreset():
     twin.reset(seed=0)
     action = np.zeros((8, 6))
     action[::2, 0] = 1.0
-    for _ in range(60):  # at the latest, an episode ends as not_reached after 6 s
+    envs._reach_time[:] = twin._reach_time[:] = 1.0
+    for _ in range(60):  # slewing at full speed ends at a joint limit, if not before
         obs, _, terminated, _, info = envs.step(action)
         twin_obs, _, _, _, twin_info = twin.advance(action)
         if terminated.any():
             break
     assert terminated.any() and not terminated.all()
     assert (info["_final_obs"] == terminated).all() and (info["_final_info"] == terminated).all()
+    assert (info["time_to_reach"] == 1.0).all()  # the new starts have not touched it
+    assert np.isinf(envs._reach_time[terminated]).all()
     for i in np.flatnonzero(terminated):
         np.testing.assert_array_equal(info["final_obs"][i], twin_obs[i])
         assert info["final_info"]["termination"][i] == twin_info["termination"][i] != "none"

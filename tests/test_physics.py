@@ -434,6 +434,22 @@ def test_both_contact_models_have_one_inertia_and_one_friction():
     assert len(np.unique(frictions, axis=0)) == 1
 
 
+def test_bands_lie_side_by_side():
+    """Along the hinge: outer bands from 0.105 to 0.19 m on either side, the inner one between."""
+    model = load_model("sdf")
+    for jaw, bands in (("jaw_outer", {(-190, -105), (105, 190)}), ("jaw_inner", {(-100, 100)})):
+        found = []
+        for i in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_SDF):
+            if model.geom_bodyid[i] == model.body(jaw).id:
+                rotation = np.zeros(9)
+                mujoco.mju_quat2Mat(rotation, model.geom_quat[i])
+                along = rotation[6:]  # the body's z in the geom's frame
+                centre = model.geom_pos[i, 2] + along @ model.geom_aabb[i, :3]
+                half = np.abs(along) @ model.geom_aabb[i, 3:]
+                found.append((round(1000 * (centre - half)), round(1000 * (centre + half))))
+        assert set(found) == bands and len(found) == 3 * len(bands)
+
+
 @pytest.mark.parametrize("contact", ["primitive", "sdf"])
 def test_what_is_only_drawn_changes_no_motion(contact):
     """A grip and a lift are bit for bit the same in a model made to be rendered."""

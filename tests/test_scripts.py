@@ -30,15 +30,21 @@ import crane_env
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_gae_with_a_termination_and_a_truncation(algorithm):
-    """gamma = 0.5, lambda = 0.5; step 1 ends by termination, step 2 by truncation with V = 4."""
-    rewards = torch.tensor([[1.0], [2.0], [3.0], [4.0]])
-    values = torch.tensor([[1.0], [1.0], [2.0], [2.0]])
-    next_values = torch.tensor([[1.0], [0.0], [4.0], [6.0]])
-    dones = torch.tensor([[0.0], [1.0], [1.0], [0.0]])
+def test_gae_with_ends(algorithm):
+    """gamma = 0.5, lambda = 0.5; crane 0: step 1 ends by termination, step 2 by truncation, V = 4.
+
+    Its 0.5 * 4 has been added to the reward of step 2. Crane 1 goes on.
+    """
+    rewards = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0 + 2.0, 3.0], [4.0, 4.0]])
+    values = torch.tensor([[1.0, 10.0], [1.0, 10.0], [2.0, 20.0], [2.0, 20.0]])
+    last_value = torch.tensor([6.0, 60.0])
+    dones = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
+    advantages = module(algorithm).compute_gae(rewards, values, last_value, dones, 0.5, 0.5)
     # deltas: 1 + .5 - 1, 2 + 0 - 1, 3 + 2 - 2, 4 + 3 - 2; only step 0 looks past itself
-    advantages = module(algorithm).compute_gae(rewards, values, next_values, dones, 0.5, 0.5)
-    torch.testing.assert_close(advantages, torch.tensor([[0.75], [1.0], [3.0], [5.0]]))
+    torch.testing.assert_close(advantages[:, 0], torch.tensor([0.75, 1.0, 3.0, 5.0]))
+    # deltas: 1 + 5 - 10, 2 + 10 - 10, 3 + 10 - 20, 4 + 30 - 20, each and a quarter of the next
+    expected = [-4 + (2 + (-7 + 14 / 4) / 4) / 4, 2 + (-7 + 14 / 4) / 4, -7 + 14 / 4, 14.0]
+    torch.testing.assert_close(advantages[:, 1], torch.tensor(expected))
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -46,24 +52,10 @@ def test_gae_without_ends_is_the_discounted_sum_of_deltas(algorithm):
     torch.manual_seed(0)
     rewards, values, no_ends = torch.randn(6, 3), torch.randn(7, 3), torch.zeros(6, 3)
     compute_gae = module(algorithm).compute_gae
-    advantages = compute_gae(rewards, values[:-1], values[1:], no_ends, 0.9, 0.8)
+    advantages = compute_gae(rewards, values[:-1], values[-1], no_ends, 0.9, 0.8)
     deltas = rewards + 0.9 * values[1:] - values[:-1]
     expected = sum(0.72**k * deltas[k] for k in range(6))
     torch.testing.assert_close(advantages[0], expected)
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_bootstrap_values(algorithm):
-    bootstrap_values = module(algorithm).bootstrap_values
-    values = torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]])
-    last_value = torch.tensor([4.0, 40.0])
-    terminations = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    cut_at, cut_values = [(0, 1), (2, 0)], torch.tensor([-7.0, -8.0])
-    expected = torch.tensor([[2.0, -7.0], [0.0, 30.0], [-8.0, 0.0]])
-    result = bootstrap_values(values, last_value, terminations, cut_at, cut_values)
-    torch.testing.assert_close(result, expected)
-    result = bootstrap_values(values, last_value, 0 * terminations, [], None)
-    torch.testing.assert_close(result, torch.cat([values[1:], last_value[None]]))
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -101,7 +93,7 @@ def test_predict_takes_raw_observations_and_the_networks_normalised_ones(algorit
     torch.testing.assert_close(actions, agent.to_env(expected))
 
 
-SHARED = "layer_init bootstrap_values compute_gae crane_kwargs is_crane make_envs save_atomically"
+SHARED = "layer_init compute_gae crane_kwargs is_crane make_envs save_atomically"
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -309,17 +301,18 @@ def test_clear_errors(tmp_path, algorithm):
     for name, change in {
         "other": {"algorithm": "other"},
         "task": {"task": crane_env.REVISION - 1},
-        "option": {"args": {"warp": 9}},
+        "more": {"args": {**args, "warp": 9}},
+        "less": {"args": {k: v for k, v in args.items() if k != "gamma"}},
     }.items():
         torch.save({**ours, **change}, tmp_path / f"{name}.pt")
     torch.save({k: v for k, v in ours.items() if k != "optimizer"}, tmp_path / "policy.pt")
-    needed = f"--resume needs a checkpoint.pt of {algorithm}, got "
+    (tmp_path / "text.pt").write_text("no checkpoint")
+    for name in ("other", "task", "more", "less", "policy", "text"):
+        result = run(algorithm, tmp_path, "--resume", f"{name}.pt", check=False)
+        message = f"--resume: {name}.pt is no checkpoint.pt of today's {algorithm}"
+        assert result.returncode == 1 and result.stderr.strip() == message
     for arguments, message in [
-        ("--resume nowhere.pt", needed + "nowhere.pt: [Errno 2] No such file"),
-        ("--resume other.pt", needed + "other.pt: of another algorithm or revision"),
-        ("--resume task.pt", needed + "task.pt: of another algorithm or revision"),
-        ("--resume policy.pt", "or a policy.pt"),
-        ("--resume option.pt", "unexpected keyword argument 'warp'"),
+        ("--resume nowhere.pt", "--resume: [Errno 2] No such file or directory: 'nowhere.pt'"),
         ("--num-envs 0", "--num-envs must be at least 1"),
         (ONE_SAMPLE[algorithm], "standard deviation"),
     ]:
