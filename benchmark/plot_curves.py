@@ -83,7 +83,7 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
             print(f"{name}, seed {run['seed']}: 96.3 % for good {when}; {total}")
     axes[0, 0].legend(fontsize=7, title="(seeds)", title_fontsize=7)
     figure.tight_layout()
-    figure.savefig(FIGURES / "learning_curves.png", dpi=100)
+    figure.savefig(FIGURES / "learning_curves.png", dpi=80)
 
 
 def ablations(runs: dict[str, list[Run]]) -> None:
