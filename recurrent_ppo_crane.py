@@ -31,6 +31,7 @@ import sys
 import time
 from collections import deque
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -148,7 +149,7 @@ class Agent(nn.Module):
         super().__init__()
         act_dim = len(action_low)
         features = obs_dim + args.lstm_size
-        self.lstm = nn.LSTMCell(obs_dim, args.lstm_size)
+        self.lstm = nn.LSTM(obs_dim, args.lstm_size)
         self.actor = self._network(features, args.hidden_sizes, act_dim, std=0.01)
         self.log_std = nn.Parameter(torch.full((act_dim,), args.log_std_init))
         self.critic = self._network(features, args.hidden_sizes, 1, std=1.0)
@@ -191,13 +192,15 @@ class Agent(nn.Module):
         state: h and c, (N, lstm_size), before obs[0]. starts (T, N) is 1 where obs begins an
         episode, whose memory is empty.
         """
-        h, c = state
+        h, c = (part[None] for part in state)
+        resets = 1 + starts[1:].any(dim=1).nonzero().flatten()
+        cuts = [0, *resets.tolist(), len(obs)]
         memories = []
-        for x, start in zip(obs, starts):
-            keep = (1 - start)[:, None]
-            h, c = self.lstm(x, (keep * h, keep * c))
-            memories.append(h)
-        return torch.cat([obs, torch.stack(memories)], dim=-1), (h, c)
+        for begin, end in pairwise(cuts):  # inside a piece nn.LSTM goes from step to step by itself
+            keep = (1 - starts[begin])[:, None]
+            memory, (h, c) = self.lstm(obs[begin:end], (keep * h, keep * c))
+            memories.append(memory)
+        return torch.cat([obs, torch.cat(memories)], dim=-1), (h[0], c[0])
 
     def get_value(self, features: Tensor) -> Tensor:
         """V of features (..., obs_dim + lstm_size)."""
