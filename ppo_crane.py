@@ -20,7 +20,7 @@ learns to lift and a long one takes time over its grip. The step size falls to 0
 
     python ppo_crane.py                      # the forestry crane, minutes on two cores
     python ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --gamma 0.99 --horizon-growth 1
-    python ppo_crane.py --resume runs/<run>/checkpoint.pt
+    python ppo_crane.py --resume runs/<run>
 """
 
 import os
@@ -58,7 +58,7 @@ class Args:
     total_timesteps: int = 1_024_000  # decisions to train for, over all cranes, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of an update; results are the same for equal numbers
-    resume: str | None = None  # checkpoint.pt to go on from; it sets all but device and threads
+    resume: str | None = None  # run's folder to go on in; it sets all but device and threads
     paper: bool = False  # take the paper's protocol (days of training) as defaults
 
     # --- environment
@@ -264,8 +264,10 @@ if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__, default=default)
     checkpoint = None
     if args.resume is not None:
+        path = Path(args.resume)
+        path = path / "checkpoint.pt" if path.is_dir() else path
         try:
-            checkpoint = torch.load(args.resume, map_location="cpu", weights_only=True)
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
             saved, task = checkpoint["args"], checkpoint["task"]
             ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
             ours &= task == crane_env.REVISION and saved.keys() == asdict(args).keys()
@@ -274,9 +276,9 @@ if __name__ == "__main__":
         except Exception:  # whatever a file that is no checkpoint may raise
             ours = False
         if not ours:
-            raise SystemExit(f"--resume: {args.resume} is no checkpoint.pt of today's {ALGORITHM}")
+            raise SystemExit(f"--resume: {path} is no checkpoint.pt of today's {ALGORITHM}")
         args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
-        print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {args.resume}")
+        print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {path}")
     elif args.paper:
         print(PAPER_GUESSES)
     for least, names in LEAST.items():
@@ -321,7 +323,7 @@ if __name__ == "__main__":
         if first_iteration > num_iterations:
             print("all updates of this run are done: only a final evaluation is made again")
         difficulty = checkpoint["difficulty"]
-        run_dir = Path(args.resume).parent
+        run_dir = path.parent
     else:
         started = f"{int(time.time())}_{os.getpid()}"
         run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{started}"
@@ -517,7 +519,7 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         save(completed)
         progress.close()
-        print(f"interrupted; go on with --resume {run_dir / 'checkpoint.pt'}")
+        print(f"interrupted; go on with --resume {run_dir}")
         raise SystemExit(130) from None
     writer.close()
     envs.close()

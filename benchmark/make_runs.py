@@ -1,11 +1,12 @@
-"""Make the training runs behind the figures: two at a time, one thread each.
+"""Make the training runs behind the figures, two at a time with one thread each.
 
     python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
     python benchmark/make_runs.py ablations   # mPPO without one ingredient, two seeds, 0.6 M
+    python benchmark/make_runs.py timed       # mPPO, three seeds, each alone with two threads
 
 Run it again to go on: what has a CSV is done (delete it to make the run again), what was
 interrupted resumes from its checkpoint. The runs lie in benchmark/runs/ (delete them after a change
-of the task), one CSV each in benchmark/curves/ or benchmark/ablations/.
+of the task), one CSV each in benchmark/curves/, ablations/ or timed/.
 """
 
 import subprocess
@@ -47,41 +48,44 @@ ABLATIONS = {
 }
 
 
-def make(folder: str, script: str, name: str, seed: int, flags: list[str]) -> str:
+def make(folder: str, script: str, name: str, seed: int, flags: list[str], threads: int) -> str:
     """Train (or go on) and export; what happened, in a line."""
     csv_path = HERE / folder / f"{name}_seed{seed}.csv"
     if csv_path.exists():
         return f"{csv_path.name} is there"
-    command = [sys.executable, str(HERE.parent / f"{script}.py"), "--torch-threads", "1"]
-    command += ["--env-threads", "1"]
-    begun = sorted(HERE.glob(f"runs/*__{name}__{seed}__*/checkpoint.pt"))
+    command = [sys.executable, str(HERE.parent / f"{script}.py")]
+    command += ["--torch-threads", str(threads), "--env-threads", str(threads)]
+    run_name = f"{folder}_{name}"
+    begun = sorted(HERE.glob(f"runs/*__{run_name}__{seed}__*/checkpoint.pt"))
     if begun:
-        command += ["--resume", str(begun[-1])]
+        command += ["--resume", str(begun[-1].parent)]
     else:
-        command += ["--exp-name", name, "--seed", str(seed), *flags]
-    with open(HERE / f"{name}_seed{seed}.log", "w") as log:
+        command += ["--exp-name", run_name, "--seed", str(seed), *flags]
+    with open(HERE / f"{run_name}_seed{seed}.log", "w") as log:
         code = subprocess.run(command, cwd=HERE, stdout=log, stderr=log).returncode
     if code:
-        return f"{name}, seed {seed}: stopped, see {log.name}"
-    (HERE / f"{name}_seed{seed}.log").unlink()
+        return f"{run_name}, seed {seed}: stopped, see {log.name}"
+    Path(log.name).unlink()
     csv_path.parent.mkdir(exist_ok=True)
-    export(max(HERE.glob(f"runs/*__{name}__{seed}__*")), csv_path)
+    export(max(HERE.glob(f"runs/*__{run_name}__{seed}__*")), csv_path)
     return f"{csv_path.name} written"
 
 
-def main(what: Positional[Literal["curves", "ablations"]], at_once: int = 2) -> None:
-    """at_once: trainings side by side, one core each."""
+def main(what: Positional[Literal["curves", "ablations", "timed"]]) -> None:
+    often = ["--eval-every", "25"]
     if what == "curves":
-        often = ["--eval-every", "25"]
-        jobs = [(what, name, name, seed, often) for seed in (1, 2, 3) for name in SCRIPTS]
+        jobs = [(name, name, seed, often, 1) for seed in (1, 2, 3) for name in SCRIPTS]
+    elif what == "timed":
+        often += ["--eval-trials", "100"]
+        jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
     else:
         jobs = [
-            (what, script, name, seed, [*SHORT, *flags])
+            (script, name, seed, [*SHORT, *flags], 1)
             for seed in (1, 2)
             for name, (script, flags) in ABLATIONS.items()
         ]
-    with ThreadPoolExecutor(at_once) as pool:
-        for line in tqdm(pool.map(lambda job: make(*job), jobs), total=len(jobs)):
+    with ThreadPoolExecutor(1 if what == "timed" else 2) as pool:
+        for line in tqdm(pool.map(lambda job: make(what, *job), jobs), total=len(jobs)):
             tqdm.write(line)
 
 

@@ -1,4 +1,4 @@
-"""Draw curves/*.csv and ablations/*.csv into assets/figures, and print what they say.
+"""Draw curves/*.csv and ablations/*.csv into assets/figures; print what they and timed/*.csv say.
 
 A run is there with the first evaluation at or above the paper's 96.3 % after which none falls below
 95 %; minutes are those of rollouts and updates, without evaluations, as the run was run.
@@ -20,6 +20,20 @@ HERE = Path(__file__).parent
 FIGURES = HERE.parent / "assets" / "figures"
 Run = dict[str, np.ndarray]  # columns, NaN where nothing was recorded
 
+PANELS = {  # of the ablations: title and runs
+    "reward": ("default", "reward_paper"),
+    "perturbation of actions": ("default", "perturb_none", "perturb_rpo"),
+    "policy, without perturbation": ("perturb_none", "gaussian"),
+    "sign of the diameter's offset": ("default", "offset_minus"),
+    "observed angle to the log": ("default", "unsigned_yaw"),
+    "axes of the observed position": ("default", "axes_world"),
+    "starts that failed before": ("default", "retry_none"),
+    "curriculum": ("default", "curriculum"),
+    "end by the time limit": ("default", "no_bootstrap"),
+    "physics steps a decision": ("default", "frame_skip_10", "frame_skip_4"),
+}
+FRAME_SKIP = {"frame_skip_10": 10, "frame_skip_4": 4}  # of runs that do not have 20
+
 
 def read(folder: str) -> dict[str, list[Run]]:
     """Runs by name, one a seed."""
@@ -27,10 +41,12 @@ def read(folder: str) -> dict[str, list[Run]]:
     for path in sorted((HERE / folder).glob("*_seed*.csv")):
         with open(path) as file:
             rows = list(csv.DictReader(file))
+        name, seed = path.stem.split("_seed")
         run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
-        run["seed"] = path.stem.split("_seed")[1]
+        run["seed"] = seed
+        run["simulation_steps"] = run["decisions"] * FRAME_SKIP.get(name, 20)
         run["minutes"] = np.nancumsum(run["rollout_s"] + run["update_s"]) / 60
-        runs.setdefault(path.stem.split("_seed")[0], []).append(run)
+        runs.setdefault(name, []).append(run)
     return runs
 
 
@@ -61,7 +77,7 @@ def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style)
 def learning_curves(runs: dict[str, list[Run]]) -> None:
     axes_of = [
         ("decisions", 1e-6, "decisions [million]"),
-        ("decisions", 20e-6, "simulation steps [million]"),
+        ("simulation_steps", 1e-6, "simulation steps [million]"),
         ("updates", 1, "updates"),
         ("minutes", 1, "minutes of training"),
     ]
@@ -75,47 +91,57 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
                 axis.set_xlabel(unit)
                 axis.grid(alpha=0.3)
             axes[line, 0].set_ylabel(title)
-        for run in seeds:
-            row, when = first_lasting(run), "never"
-            if row is not None:
-                when = f"after {run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
-            total = f"{run['minutes'][-1]:.1f} min in all"
-            print(f"{name}, seed {run['seed']}: 96.3 % for good {when}; {total}")
     axes[0, 0].legend(fontsize=7, title="(seeds)", title_fontsize=7)
     figure.tight_layout()
     figure.savefig(FIGURES / "learning_curves.png", dpi=80)
 
 
+def print_times(folder: str, runs: dict[str, list[Run]]) -> None:
+    for name, seeds in runs.items():
+        for run in seeds:
+            row, when = first_lasting(run), "never"
+            if row is not None:
+                when = f"after {run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
+            end = f"{100 * run['final_success_rate'][-1]:.1f} % after {run['minutes'][-1]:.1f} min"
+            print(f"{folder}, {name}, seed {run['seed']}: 96.3 % for good {when}; {end}")
+
+
+def half_succeed(run: Run) -> float:
+    """Simulation steps [million] until the mean action succeeds in half of its trials, or NaN."""
+    steps, success = recorded(run, "simulation_steps", "eval_success_rate")
+    return steps[np.argmax(success >= 0.5)] / 1e6 if success.max() >= 0.5 else np.nan
+
+
 def ablations(runs: dict[str, list[Run]]) -> None:
-    """Success of every seed's final policy, and the first update whose policy has half of it."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), sharey=True)
-    names = sorted(runs, key=lambda name: (name != "default", name))
-    print("| ablation | final success %, seeds | half succeed after [updates] |\n|-|-|-|")
-    for height, name in enumerate(reversed(names)):
-        final = [
-            100 * recorded(run, "decisions", "final_success_rate")[1][-1] for run in runs[name]
-        ]
-        half = []
-        for run in runs[name]:
-            updates, success = recorded(run, "updates", "eval_success_rate")
-            half.append(updates[np.argmax(success >= 0.5)] if success.max() >= 0.5 else np.nan)
-        left.plot(final, [height] * len(final), "o")
-        right.plot(half, [height] * len(half), "o")
-        print(f"| {name} | {', '.join(f'{x:.1f}' for x in final)} | ", end="")
-        print(", ".join(f"{x:.0f}" if np.isfinite(x) else "never" for x in half), "|")
-    left.set_yticks(range(len(names)), list(reversed(names)))
-    left.set_xlabel("success of the final policy [%]")
-    right.set_xlabel("updates until the mean action succeeds in half of its trials")
-    for axis in (left, right):
+    """One panel an ingredient, and a table."""
+    figure, axes = plt.subplots(2, 5, figsize=(13, 5.2), sharex=True, sharey=True)
+    for axis, (title, names) in zip(axes.flat, PANELS.items()):
+        for color, name in enumerate(names):
+            if name in runs:
+                style = {"color": f"C{color}", "label": name}
+                draw(axis, runs[name], "simulation_steps", "eval_success_rate", 1e-6, **style)
+        axis.set_title(title, fontsize=9)
+        axis.legend(fontsize=7)
         axis.grid(alpha=0.3)
+    figure.supxlabel("simulation steps [million]", fontsize=10)
+    figure.supylabel("success of the mean action", fontsize=10)
     figure.tight_layout()
-    figure.savefig(FIGURES / "ablations.png", dpi=100)
+    figure.savefig(FIGURES / "ablations.png", dpi=80)
+
+    print("\n| run | final success [%] by seed | half succeed after [million steps] |\n|-|-|-|")
+    for name in dict.fromkeys(name for names in PANELS.values() for name in names):
+        final = [100 * run["final_success_rate"][-1] for run in runs.get(name, [])]
+        half = [half_succeed(run) for run in runs.get(name, [])]
+        cells = ", ".join(f"{x:.1f}" for x in final), ", ".join(f"{x:.1f}" for x in half)
+        print(f"| {name} | {cells[0]} | {cells[1].replace('nan', 'never')} |")
 
 
 def main() -> None:
-    learning_curves(read("curves"))
-    if (HERE / "ablations").is_dir():
-        ablations(read("ablations"))
+    curves = read("curves")
+    learning_curves(curves)
+    print_times("curves", curves)
+    print_times("timed", read("timed"))
+    ablations(read("ablations"))
 
 
 if __name__ == "__main__":

@@ -255,7 +255,7 @@ def test_killed_run_goes_on(tmp_path, algorithm):
     run_dir = only_run(tmp_path)
     before = torch.load(run_dir / "checkpoint.pt", weights_only=True)
     assert 10 <= before["iteration"] < 50
-    run(algorithm, tmp_path, "--resume", str(run_dir / "checkpoint.pt"))
+    run(algorithm, tmp_path, "--resume", str(run_dir))  # the folder or the file
     again = run(algorithm, tmp_path, "--resume", str(run_dir / "checkpoint.pt"))
     assert "all updates of this run are done" in again.stdout
     after = torch.load(run_dir / "checkpoint.pt", weights_only=True)
