@@ -102,20 +102,35 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
     save(figure, "learning_curves.png")
 
 
+def crossing(run: Run, x: str, level: float) -> float:
+    """x in millions, between two evaluations, where success first reaches level, or NaN."""
+    xs, success = recorded(run, x, "eval_success_rate")
+    row = np.argmax(success >= level)
+    if success[row] < level:
+        return np.nan
+    return np.interp(level, success[: row + 1][-2:], xs[: row + 1][-2:]) / 1e6
+
+
 def print_times(folder: str, runs: dict[str, list[Run]]) -> None:
+    """Return and KL divergence: means of the last 20 and of all updates."""
+    print(
+        f"\n| {folder}, seed | 50 % after [M decisions] | 90 % | 96.3 % for good | minutes ", end=""
+    )
+    print("| all minutes | success in the end % | return | KL |\n|-|-|-|-|-|-|-|-|-|")
     for name, seeds in runs.items():
         for run in seeds:
-            row, when = first_lasting(run), "never"
+            row, good = first_lasting(run), ["never", "never"]
             if row is not None:
-                when = f"after {run['decisions'][row] / 1e6:.2f} M, {run['minutes'][row]:.1f} min"
-            end = f"{100 * run['final_success_rate'][-1]:.1f} % after {run['minutes'][-1]:.1f} min"
-            print(f"{folder}, {name}, seed {run['seed']}: 96.3 % for good {when}; {end}")
-
-
-def half_succeed(run: Run) -> float:
-    """Simulation steps [million] until the mean action succeeds in half of its trials, or NaN."""
-    steps, success = recorded(run, "simulation_steps", "eval_success_rate")
-    return steps[np.argmax(success >= 0.5)] / 1e6 if success.max() >= 0.5 else np.nan
+                good = [f"{run['decisions'][row] / 1e6:.2f}", f"{run['minutes'][row]:.1f}"]
+            cells = [f"{crossing(run, 'decisions', level):.2f}" for level in (0.5, 0.9)]
+            cells += [
+                *good,
+                f"{run['minutes'][-1]:.1f}",
+                f"{100 * run['final_success_rate'][-1]:.1f}",
+            ]
+            cells.append(f"{np.nanmean(run['episodic_return'][-20:]):.0f}")
+            cells.append(f"{np.nanmean(run['approx_kl']):.3f}")
+            print(f"| {name}, {run['seed']} | {' | '.join(cells)} |")
 
 
 def ablations(runs: dict[str, list[Run]]) -> None:
@@ -136,7 +151,7 @@ def ablations(runs: dict[str, list[Run]]) -> None:
     print("\n| run | final success [%] by seed | half succeed after [million steps] |\n|-|-|-|")
     for name in dict.fromkeys(name for names in PANELS.values() for name in names):
         final = [100 * run["final_success_rate"][-1] for run in runs.get(name, [])]
-        half = [half_succeed(run) for run in runs.get(name, [])]
+        half = [crossing(run, "simulation_steps", 0.5) for run in runs.get(name, [])]
         cells = ", ".join(f"{x:.1f}" for x in final), ", ".join(f"{x:.1f}" for x in half)
         print(f"| {name} | {cells[0]} | {cells[1].replace('nan', 'never')} |")
 
