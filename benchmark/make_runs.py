@@ -1,12 +1,12 @@
 """Make the training runs behind the figures, two at a time with one thread each.
 
     python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
-    python benchmark/make_runs.py ablations   # mPPO without one ingredient, two seeds, 0.6 M
+    python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds, 0.6 M
     python benchmark/make_runs.py timed       # mPPO, three seeds, each alone with two threads
 
-Run it again to go on: what has a CSV is done (delete it to make the run again), what was
-interrupted resumes from its checkpoint. The runs lie in benchmark/runs/ (delete them after a change
-of the task), one CSV each in benchmark/curves/, ablations/ or timed/.
+Run it again to go on: what has a CSV in benchmark/curves/, ablations/ or timed/ is done, what was
+interrupted resumes from its checkpoint in benchmark/runs/. To make a run again, delete both; after
+a change of the task or of a default, all of benchmark/runs/.
 """
 
 import subprocess
@@ -30,7 +30,8 @@ ABLATIONS = {
     "reward_paper": ("mppo_beta_crane", ["--reward", "paper"]),
     "perturb_none": ("mppo_beta_crane", ["--perturb", "none"]),
     "perturb_rpo": ("mppo_beta_crane", ["--perturb", "rpo"]),
-    "gaussian": ("ppo_crane", ["--learning-rate", "1e-3"]),  # the counterpart of perturb_none
+    # the counterpart of perturb_none: the same step size, as wide at the start and at the end
+    "gaussian": ("ppo_crane", ["--learning-rate", "1e-3", "--narrowing", "0.83"]),
     "offset_minus": ("mppo_beta_crane", ["--offset", "minus"]),
     "unsigned_yaw": ("mppo_beta_crane", ["--no-signed-yaw"]),
     "axes_world": ("mppo_beta_crane", ["--axes", "world"]),
@@ -84,10 +85,16 @@ def main(what: Positional[Literal["curves", "ablations", "timed"]]) -> None:
             for seed in (1, 2)
             for name, (script, flags) in ABLATIONS.items()
         ]
+    failed = False
     with ThreadPoolExecutor(1 if what == "timed" else 2) as pool:
         for line in tqdm(pool.map(lambda job: make(what, *job), jobs), total=len(jobs)):
             tqdm.write(line)
+            failed |= "stopped" in line
+    sys.exit(failed)
 
 
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    try:
+        tyro.cli(main, description=__doc__)
+    except KeyboardInterrupt:
+        sys.exit("interrupted; run it again to go on")
