@@ -3,16 +3,20 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds, 0.6 M
     python benchmark/make_runs.py timed       # mPPO, three seeds, each alone with two threads
+    python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of all but the ablations
 
 Run it again to go on: what has a CSV in benchmark/curves/, ablations/ or timed/ is done, what was
 interrupted resumes from its checkpoint in benchmark/runs/. To make a run again, delete both; after
 a change of the task or of a default, all of benchmark/runs/.
 """
 
+import csv
+import json
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from subprocess import PIPE
 from typing import Literal
 
 import tyro
@@ -72,7 +76,32 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
     return f"{csv_path.name} written"
 
 
-def main(what: Positional[Literal["curves", "ablations", "timed"]]) -> None:
+def evaluate() -> None:
+    """evaluations.csv: success [%] by run, seed, pose noise and diameter."""
+    rows = []
+    names = [*(f"curves_{script}" for script in SCRIPTS), f"timed_{SCRIPTS[0]}"]
+    for name in tqdm(names):
+        for policy in sorted(HERE.glob(f"runs/*__{name}__*/policy.pt")):
+            seed = policy.parent.name.split("__")[2]
+            for noise in ("none", "step"):
+                command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(policy)]
+                command += ["--json", "--pose-noise", noise]
+                result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
+                row = {"run": name, "seed": seed, "pose_noise": noise}
+                for cell in result["cells"]:
+                    row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
+                rows.append(row | {"mean": round(100 * result["mean_success_rate"], 2)})
+    if not rows:
+        sys.exit("benchmark/runs has no curves and no timed runs: make them first")
+    with open(HERE / "evaluations.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main(what: Positional[Literal["curves", "ablations", "timed", "evaluate"]]) -> None:
+    if what == "evaluate":
+        return evaluate()
     often = ["--eval-every", "25"]
     if what == "curves":
         jobs = [(name, name, seed, often, 1) for seed in (1, 2, 3) for name in SCRIPTS]
