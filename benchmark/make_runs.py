@@ -77,7 +77,7 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
 
 
 def evaluate() -> None:
-    """evaluations.csv: success [%] by run, seed, pose noise and diameter."""
+    """Write evaluations.csv anew: success [%] of all runs that are there, by diameter."""
     rows = []
     names = [*(f"curves_{script}" for script in SCRIPTS), f"timed_{SCRIPTS[0]}"]
     for name in tqdm(names):
