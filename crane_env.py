@@ -392,7 +392,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         draws = self.max_decisions + 1 if pose_noise == "step" else 1
         self._decisions = np.zeros(self.num_envs, int)
         self._reach_time = np.full(self.num_envs, np.inf)
-        self._window = np.zeros((self.num_envs, window, 4))  # clearance, touching (2), miss
+        # at the last decisions, for `success_conditions`
+        self._clearance, self._miss = np.zeros((2, self.num_envs, window))
+        self._touching = np.zeros((self.num_envs, window, 2), bool)
         self._noise = np.zeros((self.num_envs, draws, 2))  # epsilon; "none" never reads it
         self._rngs: list[tuple[Generator, Generator]] | None = None
         self._starts: list[tuple] = [()] * self.num_envs
@@ -454,15 +456,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         near = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.minimum(self._reach_time, np.where(near, time, np.inf))
         reached = np.isfinite(self._reach_time)
-        slot = self._decisions % self._window.shape[1]
-        now = np.column_stack([info["clearance"], state.touching, info["centre_miss"]])
-        self._window[np.arange(self.num_envs), slot] = now
+        now = np.arange(self.num_envs), self._decisions % self._clearance.shape[1]
+        self._clearance[now], self._touching[now] = info["clearance"], state.touching
+        self._miss[now] = info["centre_miss"]
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         truncated = ending == "time_limit"
         terminated = (ending != "none") & ~truncated
-        w = self._window
-        conditions = success_conditions(reached, w[..., 0], w[..., 1:3] > 0, w[..., 3])
+        conditions = success_conditions(reached, self._clearance, self._touching, self._miss)
         conditions["success"] &= truncated
         info |= conditions | {"termination": ending, "time_to_reach": self._reach_time.copy()}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]

@@ -9,8 +9,10 @@ The paper's second baseline (Vu et al., Sec. IV-B), after Schulman et al., 2015:
     max  g^T s   subject to   1/2 s^T F s <= delta,        g = grad E[rho A],
     s    = sqrt(2 delta / x^T F x) x,   F x = g            F = Hessian of the KL + d I; x by
                                                            conjugate gradient over a sample of the
-                                                           rollout, F v by a backward pass through
-                                                           the KL's gradient, never F itself
+                                                           rollout, with products F v = J^T M J v
+                                                           + d v, never F itself (Appendix C): J
+                                                           the Jacobian of mu and log sigma, M of
+                                                           1 / sigma^2 for mu, 2 for log sigma
     accepted: the first of s, c s, c^2 s, ... with KL <= delta and E[rho A] improved, over the
               whole rollout, or none;
 
@@ -214,19 +216,28 @@ def flat(tensors: Iterable[Tensor]) -> Tensor:
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-def kl_gradient(agent: Agent, obs: Tensor) -> Tensor:
-    """Gradient of the mean KL(pi_old || pi) over obs at pi = pi_old: 0, but with its graph."""
-    distribution = agent.get_distribution(obs)
-    old = Normal(distribution.loc.detach(), distribution.scale.detach(), validate_args=False)
-    kl = kl_divergence(old, distribution).sum(-1).mean()
-    return flat(torch.autograd.grad(kl, agent.policy_parameters(), create_graph=True))
+def mean_jacobian(agent: Agent, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What products with J = d mu(obs) / d theta take: mu (B, act_dim), some u like it, J^T u."""
+    mean = agent.actor(obs)
+    dual = torch.zeros_like(mean, requires_grad=True)  # J^T u is linear in u: any u will do
+    weights = list(agent.actor.parameters())
+    return mean, dual, flat(torch.autograd.grad(mean, weights, dual, create_graph=True))
 
 
-def fisher_vector_product(agent: Agent, kl_grad: Tensor, damping: float, vector: Tensor) -> Tensor:
-    """(F + damping I) vector: the gradient of `kl_gradient`^T vector (Pearlmutter, 1994)."""
-    parameters = agent.policy_parameters()
-    product = torch.autograd.grad(kl_grad @ vector, parameters, retain_graph=True)
-    return flat(product) + damping * vector
+def fisher_vector_product(
+    agent: Agent, jacobian: tuple[Tensor, Tensor, Tensor], damping: float, vector: Tensor
+) -> Tensor:
+    """(F + damping I) vector, F = E[J^T J / sigma^2] and 2 for each log sigma.
+
+    jacobian is that of `mean_jacobian`. J v is the gradient of v^T J^T u with respect to u.
+    """
+    mean, dual, pulled = jacobian
+    v_mean, v_log_std = vector.split([len(pulled), len(agent.log_std)])
+    (change,) = torch.autograd.grad(pulled, dual, v_mean, retain_graph=True)  # J v
+    change = change * torch.exp(-2 * agent.log_std.detach()) / len(mean)
+    weights = list(agent.actor.parameters())
+    product = torch.autograd.grad(mean, weights, change, retain_graph=True)
+    return torch.cat([flat(product), 2 * v_log_std]) + damping * vector
 
 
 def conjugate_gradient(
@@ -527,11 +538,11 @@ if __name__ == "__main__":
             gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
             # the direction by products over a sample, its length by one over the whole rollout
             sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
-            kl_grad = kl_gradient(agent, b_obs[sample])
-            matvec = partial(fisher_vector_product, agent, kl_grad, args.cg_damping)
+            jacobian = mean_jacobian(agent, b_obs[sample])
+            matvec = partial(fisher_vector_product, agent, jacobian, args.cg_damping)
             direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
-            kl_grad = kl_gradient(agent, b_obs)
-            product = fisher_vector_product(agent, kl_grad, args.cg_damping, direction)
+            jacobian = mean_jacobian(agent, b_obs)
+            product = fisher_vector_product(agent, jacobian, args.cg_damping, direction)
             full_step = torch.sqrt(2 * args.max_kl / (direction @ product + 1e-12)) * direction
             step_fraction, kl, improvement = line_search(agent, full_step, batch, args)
             stats: dict[str, list[float]] = {

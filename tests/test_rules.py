@@ -215,7 +215,7 @@ def test_success_needs_the_whole_episode():
     """The window holds the last 0.5 s, and success comes with the time limit only."""
     for frame_skip, window in [(20, 6), (1, 101), (4, 26)]:
         envs = CraneVectorEnv(1, frame_skip=frame_skip)
-        assert envs._window.shape[1] == window
+        assert envs._clearance.shape[1] == window
         assert envs.max_decisions * frame_skip == 1800
     envs = CraneVectorEnv(1)
     envs.reset(seed=0)
