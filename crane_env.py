@@ -69,7 +69,7 @@ from numpy.random import Generator, SeedSequence, default_rng
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 REVISION = 6  # of the task; raise it when a change spoils policies or checkpoints
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
-ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators
+ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
 LOG_LENGTH = 2.75  # m
 LOG_DENSITY = 650.0  # kg/m^3
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
@@ -475,11 +475,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
         self._ctrl[:, :8] = self._ctrl[:, 8:] = command
         failed = np.zeros(self.num_envs, bool)
+        # Anti-windup: the integrator leads its joint by no more than the force limit can use.
+        # At zero command this lead goes on squeezing the log as a check valve would.
+        due = self._decisions % max(1, ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, ANTI_WINDUP):
-            # Anti-windup: the integrator leads its joint by no more than the force limit can use.
-            # At zero command this lead goes on squeezing the log as a check valve would.
-            position = self._qpos[:, self._servo_q]
-            self._act[:] = np.clip(self._act, position - self._max_lead, position + self._max_lead)
+            position = self._qpos[due][:, self._servo_q]
+            low, high = position - self._max_lead, position + self._max_lead
+            self._act[due] = np.clip(self._act[due], low, high)
             nstep = min(ANTI_WINDUP, self.frame_skip - start)
             try:
                 self.batch.step(nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)

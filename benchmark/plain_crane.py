@@ -76,12 +76,14 @@ class PlainCrane(gymnasium.Env):
             a = min(max(a, -1.0), 1.0)
             command.append(a * high if a >= 0 else -a * low)
         self.ctrl[:] = 2 * [command[i] for i in crane_env.COMMAND_OF_SERVO]
+        due = self.decisions % max(1, crane_env.ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, crane_env.ANTI_WINDUP):
-            qpos = self.qpos.tolist()
-            self.act[:] = [
-                min(max(a, qpos[i] - lead), qpos[i] + lead)
-                for a, (i, lead) in zip(self.act.tolist(), self.servos)
-            ]
+            if due:
+                qpos = self.qpos.tolist()
+                self.act[:] = [
+                    min(max(a, qpos[i] - lead), qpos[i] + lead)
+                    for a, (i, lead) in zip(self.act.tolist(), self.servos)
+                ]
             nstep = min(crane_env.ANTI_WINDUP, self.frame_skip - start)
             if start == 0:
                 mujoco.mj_step2(model, data)  # mj_step1 has been called, for the observation
