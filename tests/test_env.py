@@ -139,9 +139,9 @@ def test_frame_skip_changes_the_decisions_not_the_physics():
     make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic=False)
     act, commands, ends = make_act(), [], []
     for frame_skip in (20, 5, 1):
-        envs = CraneVectorEnv(8, **kwargs | {"frame_skip": frame_skip})
-        obs, _ = envs.reset(seed=2)
-        for k in range(50):
+        envs = CraneVectorEnv(16, **kwargs | {"frame_skip": frame_skip})
+        obs, _ = envs.reset(seed=3)
+        for k in range(60):
             if frame_skip == 20:
                 commands.append(act(obs))
             for _ in range(20 // frame_skip):
