@@ -392,7 +392,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         draws = self.max_decisions + 1 if pose_noise == "step" else 1
         self._decisions = np.zeros(self.num_envs, int)
         self._reach_time = np.full(self.num_envs, np.inf)
-        # at the last decisions, for `success_conditions`
+        # of the last `window` decisions, written in turn, for `success_conditions`
         self._clearance, self._miss = np.zeros((2, self.num_envs, window))
         self._touching = np.zeros((self.num_envs, window, 2), bool)
         self._noise = np.zeros((self.num_envs, draws, 2))  # epsilon; "none" never reads it
@@ -456,9 +456,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         near = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.minimum(self._reach_time, np.where(near, time, np.inf))
         reached = np.isfinite(self._reach_time)
-        now = np.arange(self.num_envs), self._decisions % self._clearance.shape[1]
-        self._clearance[now], self._touching[now] = info["clearance"], state.touching
-        self._miss[now] = info["centre_miss"]
+        slot = np.arange(self.num_envs), self._decisions % self._clearance.shape[1]
+        self._clearance[slot], self._touching[slot] = info["clearance"], state.touching
+        self._miss[slot] = info["centre_miss"]
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         truncated = ending == "time_limit"
@@ -476,12 +476,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._ctrl[:, :8] = self._ctrl[:, 8:] = command
         failed = np.zeros(self.num_envs, bool)
         # Anti-windup: the integrator leads its joint by no more than the force limit can use.
-        # At zero command this lead goes on squeezing the log as a check valve would.
+        # At zero command this lead goes on squeezing the log as a check valve would. Decisions
+        # shorter than ANTI_WINDUP share a clamp, counted from the start of the crane's episode.
         due = self._decisions % max(1, ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, ANTI_WINDUP):
-            position = self._qpos[due][:, self._servo_q]
+            position = self._qpos[:, self._servo_q]
             low, high = position - self._max_lead, position + self._max_lead
-            self._act[due] = np.clip(self._act[due], low, high)
+            np.clip(self._act, low, high, out=self._act, where=due[:, None])
             nstep = min(ANTI_WINDUP, self.frame_skip - start)
             try:
                 self.batch.step(nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)

@@ -7,12 +7,13 @@ The paper's second baseline (Vu et al., Sec. IV-B), after Schulman et al., 2015:
   divergence from the old policy permits:
 
     max  g^T s   subject to   1/2 s^T F s <= delta,        g = grad E[rho A],
-    s    = sqrt(2 delta / x^T F x) x,   F x = g            F = Hessian of the KL + d I; x by
-                                                           conjugate gradient over a sample of the
-                                                           rollout, with products F v = J^T M J v
-                                                           + d v, never F itself (Appendix C): J
-                                                           the Jacobian of mu and log sigma, M of
-                                                           1 / sigma^2 for mu, 2 for log sigma
+    s    = sqrt(2 delta / x^T F x) x,   F x = g            F = H + d I, H the Hessian of the mean
+                                                           KL at pi_old: E[J^T M J], J = d(mu, log
+                                                           sigma) / d theta at one state and M =
+                                                           diag(1/sigma^2, 2). x by conjugate
+                                                           gradient over a sample of the rollout,
+                                                           with products F v, never F itself
+                                                           (Schulman et al., App. C.1)
     accepted: the first of s, c s, c^2 s, ... with KL <= delta and E[rho A] improved, over the
               whole rollout, or none;
 
@@ -41,7 +42,6 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -216,28 +216,24 @@ def flat(tensors: Iterable[Tensor]) -> Tensor:
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-def mean_jacobian(agent: Agent, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What products with J = d mu(obs) / d theta take: mu (B, act_dim), some u like it, J^T u."""
-    mean = agent.actor(obs)
-    dual = torch.zeros_like(mean, requires_grad=True)  # J^T u is linear in u: any u will do
-    weights = list(agent.actor.parameters())
-    return mean, dual, flat(torch.autograd.grad(mean, weights, dual, create_graph=True))
+def fisher_product(agent: Agent, obs: Tensor, damping: float) -> Callable[[Tensor], Tensor]:
+    """v -> (H + damping I) v at the agent as it is, v like the flat `policy_parameters`.
 
-
-def fisher_vector_product(
-    agent: Agent, jacobian: tuple[Tensor, Tensor, Tensor], damping: float, vector: Tensor
-) -> Tensor:
-    """(F + damping I) vector, F = E[J^T J / sigma^2] and 2 for each log sigma.
-
-    jacobian is that of `mean_jacobian`. J v is the gradient of v^T J^T u with respect to u.
+    H = E[J^T J / sigma^2] for the weights of mu, J = d mu / d weights, and 2 for each log sigma.
+    There are no second derivatives of mu in it, for d KL / d mu is 0 at the old policy.
     """
-    mean, dual, pulled = jacobian
-    v_mean, v_log_std = vector.split([len(pulled), len(agent.log_std)])
-    (change,) = torch.autograd.grad(pulled, dual, v_mean, retain_graph=True)  # J v
-    change = change * torch.exp(-2 * agent.log_std.detach()) / len(mean)
-    weights = list(agent.actor.parameters())
-    product = torch.autograd.grad(mean, weights, change, retain_graph=True)
-    return torch.cat([flat(product), 2 * v_log_std]) + damping * vector
+    mean, weights = agent.actor(obs), list(agent.actor.parameters())
+    u = torch.zeros_like(mean, requires_grad=True)  # any value will do, for J^T u is linear in it
+    jt_u = flat(torch.autograd.grad(mean, weights, u, create_graph=True))
+
+    def product(v: Tensor) -> Tensor:
+        v_weights, v_log_std = v.split([len(jt_u), len(agent.log_std)])
+        (jv,) = torch.autograd.grad(jt_u, u, v_weights, retain_graph=True)  # d(v^T J^T u) / du
+        mjv = jv * torch.exp(-2 * agent.log_std.detach()) / len(obs)
+        jt_mjv = flat(torch.autograd.grad(mean, weights, mjv, retain_graph=True))
+        return torch.cat([jt_mjv, 2 * v_log_std]) + damping * v
+
+    return product
 
 
 def conjugate_gradient(
@@ -538,11 +534,9 @@ if __name__ == "__main__":
             gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
             # the direction by products over a sample, its length by one over the whole rollout
             sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
-            jacobian = mean_jacobian(agent, b_obs[sample])
-            matvec = partial(fisher_vector_product, agent, jacobian, args.cg_damping)
+            matvec = fisher_product(agent, b_obs[sample], args.cg_damping)
             direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
-            jacobian = mean_jacobian(agent, b_obs)
-            product = fisher_vector_product(agent, jacobian, args.cg_damping, direction)
+            product = fisher_product(agent, b_obs, args.cg_damping)(direction)
             full_step = torch.sqrt(2 * args.max_kl / (direction @ product + 1e-12)) * direction
             step_fraction, kl, improvement = line_search(agent, full_step, batch, args)
             stats: dict[str, list[float]] = {
