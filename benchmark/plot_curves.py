@@ -33,6 +33,7 @@ PANELS = {  # of the ablations: title and runs
     "end by the time limit": ("default", "no_bootstrap"),
     "physics steps a decision": ("default", "frame_skip_10", "frame_skip_4"),
 }
+COLORS = {"default": "C0", "perturb_rpo": "C2", "gaussian": "C2", "frame_skip_4": "C2"}
 FRAME_SKIP = {"frame_skip_10": 10, "frame_skip_4": 4}  # of runs that do not have 20
 
 
@@ -145,14 +146,15 @@ def ablations(runs: dict[str, list[Run]]) -> None:
         return
     figure, axes = plt.subplots(2, 5, figsize=(13, 5.2), sharex=True, sharey=True)
     for axis, (title, names) in zip(axes.flat, PANELS.items()):
-        for color, name in enumerate(names):
-            for k, run in enumerate(runs.get(name, [])):  # two seeds have no spread: a line each
+        for name in names:
+            color = COLORS.get(name, "C1")
+            for run, style in zip(runs.get(name, []), ("-", "--")):  # two seeds have no spread
                 xs, success = recorded(run, "simulation_steps", "eval_success_rate")
-                label = "_" * (k > 0) + name  # once in the legend
-                axis.plot(xs / 1e6, success, color=f"C{color}", lw=1.2, label=label)
+                label = name if style == "-" else None
+                axis.plot(xs / 1e6, success, style, color=color, lw=1.2, label=label)
         axis.set_title(title, fontsize=9)
         if axis.lines:
-            axis.legend(fontsize=7)
+            axis.legend(fontsize=7, framealpha=0.4)
         axis.grid(alpha=0.3)
     figure.supxlabel("simulation steps [million]", fontsize=10)
     figure.supylabel("success of the mean action", fontsize=10)
