@@ -125,7 +125,7 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
         maker = sb3_contrib.TRPO
         options |= {"n_critic_updates": options.pop("n_epochs")}
         # SB3 averages the KL divergence over the action's 6 components, ours sums it
-        options |= {"target_kl": 0.02 / 6, "cg_damping": 0.1 / 6}
+        options |= {"target_kl": 0.04 / 6, "cg_damping": 0.1 / 6}
         # theirs takes gradient and line search over the sample too
         options |= {"sub_sampling_factor": max(1, rollout // FISHER_SAMPLES)}
     elif algorithm == "RecurrentPPO":  # one memory, as ours; its networks do not see obs beside it

@@ -169,6 +169,6 @@ def test_direction_from_a_sample_length_from_all(tmp_path):
         assert events.Scalars("trpo/line_search_ok")[0].value == 1
         # the length is that of all 64's curvature, so the line search need not shorten it
         assert events.Scalars("trpo/step_fraction")[0].value == 1
-        assert 0.01 < events.Scalars("trpo/kl")[0].value <= 0.02
+        assert 0.02 < events.Scalars("trpo/kl")[0].value <= 0.04
     assert not torch.equal(weights[8], weights[64])
     assert torch.equal(weights[64], weights[1024])  # there are no more than 64
