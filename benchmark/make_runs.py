@@ -92,7 +92,9 @@ def evaluate() -> None:
                     row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
                 rows.append(row | {"mean": round(100 * result["mean_success_rate"], 2)})
     if not rows:
-        sys.exit("benchmark/runs has no curves and no timed runs: make them first")
+        sys.exit(
+            "benchmark/runs has no policies: delete CSVs of curves/ and timed/ and make those runs"
+        )
     with open(HERE / "evaluations.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()

@@ -70,7 +70,8 @@ def first_lasting(run: Run, level: float = 0.963, floor: float = 0.95) -> int | 
 def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style) -> None:
     """Mean over seeds at the first one's points, their spread shaded."""
     points = [recorded(run, x, y) for run in runs]
-    xs = points[0][0][points[0][0] <= min(x[-1] for x, _ in points)]
+    end = min(x[-1] for x, _ in points)
+    xs = np.append(points[0][0][points[0][0] < end], end)
     ys = np.array([np.interp(xs, *point) for point in points])
     axis.plot(xs * scale, ys.mean(0), **style)
     axis.fill_between(xs * scale, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
@@ -123,7 +124,7 @@ def print_times(folder: str, runs: dict[str, list[Run]]) -> None:
     print(
         f"\n| {folder}, seed | 50 % after [M decisions] | 90 % | 96.3 % for good | minutes ", end=""
     )
-    print("| all minutes | success in the end % | return |\n|-|-|-|-|-|-|-|-|")
+    print("| all minutes | 600 trials of seed 10000 % | return |\n|-|-|-|-|-|-|-|-|")
     for name, seeds in runs.items():
         for run in seeds:
             row, good = first_lasting(run), ["never", "never"]
@@ -148,9 +149,9 @@ def ablations(runs: dict[str, list[Run]]) -> None:
     for axis, (title, names) in zip(axes.flat, PANELS.items()):
         for name in names:
             color = COLORS.get(name, "C1")
-            for run, style in zip(runs.get(name, []), ("-", "--")):  # two seeds have no spread
+            for run in runs.get(name, []):  # a line each: two seeds have no spread
                 xs, success = recorded(run, "simulation_steps", "eval_success_rate")
-                label = name if style == "-" else None
+                style, label = ("-", name) if run["seed"] == "1" else ("--", None)
                 axis.plot(xs / 1e6, success, style, color=color, lw=1.2, label=label)
         axis.set_title(title, fontsize=9)
         if axis.lines:
@@ -160,12 +161,16 @@ def ablations(runs: dict[str, list[Run]]) -> None:
     figure.supylabel("success of the mean action", fontsize=10)
     save(figure, "ablations.png")
 
-    print("\n| run | final success [%] by seed | half succeed after [million steps] |\n|-|-|-|")
+    print("\n| run, seed | 50 % after [M steps] | 90 % | 600 trials of seed 10000 % ", end="")
+    print("| sampled actions in the end % | return |\n|-|-|-|-|-|-|")
     for name in dict.fromkeys(name for names in PANELS.values() for name in names):
-        final = [100 * run["final_success_rate"][-1] for run in runs.get(name, [])]
-        half = [crossing(run, "simulation_steps", 0.5) for run in runs.get(name, [])]
-        cells = ", ".join(f"{x:.1f}" for x in final), ", ".join(f"{x:.1f}" for x in half)
-        print(f"| {name} | {cells[0]} | {cells[1].replace('nan', 'never')} |")
+        for run in runs.get(name, []):
+            cells = [f"{crossing(run, 'simulation_steps', level):.1f}" for level in (0.5, 0.9)]
+            for key in ("final_success_rate", "training_success_rate"):
+                cells.append(f"{100 * run[key][-1]:.1f}")
+            returns = recorded(run, "decisions", "eval_episodic_return")[1]
+            line = " | ".join([f"{name}, {run['seed']}", *cells, f"{returns[-1]:.0f}"])
+            print(f"| {line.replace('nan', 'never')} |")
 
 
 def main() -> None:

@@ -377,7 +377,9 @@ def test_time_limit_is_not_the_end_of_the_world(tmp_path, algorithm, flag):
     if algorithm == "recurrent_ppo":
         obs = agent.remember(obs[None], agent.initial_state(1), torch.ones(1, 1))[0][0]
     value = agent.get_value(obs).item()
-    assert value == pytest.approx(10, abs=1) if flag == "--bootstrap" else 0.5 < value < 4.2
+    # seeds 1 to 4 of recurrent PPO end between 8.8 and 11.1; with a cut as an end, or with a reward
+    # that does not fall while the horizon grows, V ends far from there
+    assert value == pytest.approx(10, abs=2) if flag == "--bootstrap" else 0.5 < value < 4.2
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
