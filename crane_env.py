@@ -484,8 +484,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             low, high = position - self._max_lead, position + self._max_lead
             np.clip(self._act, low, high, out=self._act, where=due[:, None])
             nstep = min(ANTI_WINDUP, self.frame_skip - start)
+            # Sensors are read after the last; where a clamp follows they would be computed in vain.
+            last = start + nstep == self.frame_skip
+            stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
             try:
-                self.batch.step(nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)
+                self.batch.step(nstep=nstep, stage=stage)
             except SimulationError as error:
                 failed[error.ids] = True
         finite = np.isfinite(self._qpos).all(axis=-1) & np.isfinite(self._qvel).all(axis=-1)

@@ -31,7 +31,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning, two runs at once would stall
+os.environ.setdefault("GOMP_SPINCOUNT", "5000")  # spinning for longer, two runs at once would stall
 
 import gymnasium
 import numpy as np

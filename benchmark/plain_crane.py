@@ -1,4 +1,7 @@
-"""One crane in plain MuJoCo calls: what throughput.py gives to Gymnasium and Stable-Baselines3."""
+"""One crane in plain MuJoCo calls: what throughput.py gives to Gymnasium and Stable-Baselines3.
+
+`NumpyCrane` is written as most environments are, `PlainCrane` for speed.
+"""
 
 import sys
 from collections.abc import Callable
@@ -33,8 +36,8 @@ class PlainCrane(gymnasium.Env):
         self.servo_q, self.servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
         integrals = [model.actuator(f"{name}_integral").id for name in crane_env.SERVOS]
         self.kp = model.actuator_gainprm[integrals, 0]
-        lead = model.jnt_actfrcrange[servos, 1] / self.kp
-        self.servos = list(zip(self.servo_q.tolist(), lead.tolist()))
+        self.lead = model.jnt_actfrcrange[servos, 1] / self.kp
+        self.servos = list(zip(self.servo_q.tolist(), self.lead.tolist()))
         self.limits = model.jnt_range[joints][crane_env.LIMITED].tolist()
         self.speeds = crane_env.SPEEDS["real"].T.tolist()  # lowest and highest of each joint
         self.log_q = model.joint("log").qposadr[0]
@@ -71,19 +74,11 @@ class PlainCrane(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         model, data = self.model, self.data
-        command = []
-        for a, (low, high) in zip(action.tolist(), self.speeds):
-            a = min(max(a, -1.0), 1.0)
-            command.append(a * high if a >= 0 else -a * low)
-        self.ctrl[:] = 2 * [command[i] for i in crane_env.COMMAND_OF_SERVO]
+        command = self._command(action)
         due = self.decisions % max(1, crane_env.ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, crane_env.ANTI_WINDUP):
             if due:
-                qpos = self.qpos.tolist()
-                self.act[:] = [
-                    min(max(a, qpos[i] - lead), qpos[i] + lead)
-                    for a, (i, lead) in zip(self.act.tolist(), self.servos)
-                ]
+                self._clamp()
             nstep = min(crane_env.ANTI_WINDUP, self.frame_skip - start)
             if start == 0:
                 mujoco.mj_step2(model, data)  # mj_step1 has been called, for the observation
@@ -100,13 +95,32 @@ class PlainCrane(gymnasium.Env):
         diverged = bool(self.warnings.number.any())
         terminated = (
             diverged
-            or not all(low <= x <= high for x, (low, high) in zip(q, self.limits))
-            or not all(2 * low <= v <= 2 * high for v, (low, high) in zip(dq, self.speeds))
+            or not self._within_limits(q, dq)
             or distance > crane_env.LOG_RANGE
             or (not self.reached and now > crane_env.REACH_TIME - 1e-9)
         )
         truncated = not terminated and now > crane_env.TIME_LIMIT - 1e-9
         return obs, 0.0 if diverged else reward, terminated, truncated, {}
+
+    def _command(self, action: np.ndarray) -> list[float]:
+        command = []
+        for a, (low, high) in zip(action.tolist(), self.speeds):
+            a = min(max(a, -1.0), 1.0)
+            command.append(a * high if a >= 0 else -a * low)
+        self.ctrl[:] = 2 * [command[i] for i in crane_env.COMMAND_OF_SERVO]
+        return command
+
+    def _clamp(self) -> None:
+        qpos = self.qpos.tolist()
+        self.act[:] = [
+            min(max(a, qpos[i] - lead), qpos[i] + lead)
+            for a, (i, lead) in zip(self.act.tolist(), self.servos)
+        ]
+
+    def _within_limits(self, q: list[float], dq: list[float]) -> bool:
+        return all(low <= x <= high for x, (low, high) in zip(q, self.limits)) and all(
+            2 * low <= v <= 2 * high for v, (low, high) in zip(dq, self.speeds)
+        )
 
     def _observe(self, command: list[float]) -> tuple:
         """Observation and staged reward, and what the termination rules need."""
@@ -140,13 +154,69 @@ class PlainCrane(gymnasium.Env):
         return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
 
 
-def disagreement(make_act: Callable, kwargs: dict, frame_skip: int) -> tuple[float, float]:
-    """Largest difference of an observation and of a reward between PlainCrane and CraneVectorEnv.
+class NumpyCrane(PlainCrane):
+    """PlainCrane with NumPy on small arrays."""
+
+    def __init__(self, frame_skip: int = 20):
+        super().__init__(frame_skip)
+        self.speeds, self.limits = np.array(self.speeds).T, np.array(self.limits).T
+
+    def _command(self, action: np.ndarray) -> np.ndarray:
+        action = np.clip(action, -1.0, 1.0)
+        command = np.where(action < 0, -action * self.speeds[0], action * self.speeds[1])
+        self.ctrl[:] = np.tile(command[crane_env.COMMAND_OF_SERVO], 2)
+        return command
+
+    def _clamp(self) -> None:
+        position = self.qpos[self.servo_q]
+        self.act[:] = np.clip(self.act, position - self.lead, position + self.lead)
+
+    def _within_limits(self, q: np.ndarray, dq: np.ndarray) -> bool:
+        low, high = self.limits
+        q = q[crane_env.LIMITED]
+        slow = np.all((2 * self.speeds[0] <= dq) & (dq <= 2 * self.speeds[1]))
+        return bool(slow and np.all((low <= q) & (q <= high)))
+
+    def _observe(self, command: np.ndarray) -> tuple:
+        q, dq = self.qpos[self.q_at], self.qvel[self.dq_at]
+        centre, axis, log_centre, log_axis = self.sensordata[:12].reshape(4, 3)
+        delta_p = log_centre - centre
+        distance, miss = np.linalg.norm(delta_p), np.dot(delta_p, log_axis)
+        level = log_axis[:2] / np.maximum(np.linalg.norm(log_axis[:2]), 1e-9)
+        dot, cross = np.dot(axis[:2], level), axis[0] * level[1] - axis[1] * level[0]
+        angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
+        slew = (np.arctan2(log_centre[1], log_centre[0]) - q[0] + np.pi) % (2 * np.pi) - np.pi
+        rotator = q[6] + slew - angle
+        if np.abs(rotator) > crane_env.ROTATOR_MAX:
+            angle += np.pi * np.sign(rotator)
+        delta_p[2] += (crane_env.D_MAX - self.diameter) / 2
+        d_combine = np.linalg.norm(delta_p) + 1.0 - np.minimum(np.abs(dot), 1.0)
+
+        up = np.minimum(np.abs(log_axis[2]), 1.0)
+        below = crane_env.LOG_LENGTH / 2 * up + self.diameter / 2 * np.sqrt(1 - up**2)
+        clearance = np.maximum(log_centre[2] - below, 1e-9)
+        off_centre = (miss / crane_env.CENTRED) ** 2
+        near = np.minimum(1.0, np.exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
+        grasp = 2 * near * np.exp(-off_centre / 4) * q[7] / crane_env.Q8_MAX
+        lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
+        reward = np.exp(-d_combine) + grasp + 2 * lift
+        if np.all(self.sensordata[12:14] > 0):
+            reward += 3 * (1 - np.tanh(np.linalg.norm(command[:5]))) * lift
+        c, s = np.cos(q[0]), np.sin(q[0])
+        along = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ delta_p
+        obs = np.concatenate([q, dq, along, [angle]]).astype(np.float32)
+        return obs, float(reward), d_combine, distance, q, dq
+
+
+def disagreement(
+    make: type[PlainCrane], make_act: Callable, kwargs: dict, frame_skip: int
+) -> tuple[float, float]:
+    """Largest difference of an observation and of a reward between `make` and CraneVectorEnv.
 
     Two whole episodes by the policy, which grips and lifts in them, two by noise.
     """
     envs = crane_env.CraneVectorEnv(4, **kwargs | {"frame_skip": frame_skip})
-    plain = [PlainCrane(frame_skip) for _ in range(4)]
+    plain = [make(frame_skip) for _ in range(4)]
     obs, _ = envs.reset(seed=list(range(4)))
     ours = [env.reset(seed=i)[0] for i, env in enumerate(plain)]
     ended, act, worst = np.zeros(4, bool), make_act(), np.abs(obs - ours).max()
@@ -158,7 +228,7 @@ def disagreement(make_act: Callable, kwargs: dict, frame_skip: int) -> tuple[flo
         for i in np.flatnonzero(~ended):
             its_obs, reward, *ends, _ = plain[i].step(actions[i])
             if ends != [terminated[i], truncated[i]]:
-                sys.exit(f"PlainCrane ends otherwise than CraneVectorEnv, at decision {decision}")
+                sys.exit(f"{make.__name__} ends otherwise, at decision {decision}")
             worst = max(worst, np.abs(its_obs - obs[i]).max())
             worst_reward = max(worst_reward, abs(reward - rewards[i]))
             ended[i] = any(ends)

@@ -12,7 +12,6 @@ import numpy as np
 import sb3_contrib
 import stable_baselines3
 import torch
-from plain_crane import PlainCrane
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -106,9 +105,12 @@ class CollectOnly(stable_baselines3.PPO):
         pass
 
 
-def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) -> Training:
-    """Five iterations of SB3 on n cranes, those with the better number of threads."""
-    makers = [partial(PlainCrane, frame_skip)] * n
+def train_sb3(
+    algorithm: str, crane: type, kind: str, n: int, frame_skip: int, rollout: int
+) -> Training:
+    """Five iterations of SB3 on n of `crane`, those with the better number of threads."""
+    rollout = min(rollout, 2048) if algorithm == "defaults" else rollout  # theirs
+    makers = [partial(crane, frame_skip)] * n
     if kind == "Subproc":
         envs = SubprocVecEnv(makers, start_method=START)
     else:
@@ -139,6 +141,6 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
     return Training([rollout / i[0] for i in chosen], [i[1] for i in chosen], threads)
 
 
-def try_arrangements(frame_skip: int, rollout: int) -> list[Training]:
+def try_arrangements(crane: type, frame_skip: int, rollout: int) -> list[Training]:
     """SB3's PPO that only collects, in each of ARRANGEMENTS."""
-    return [train_sb3("collect", *how, frame_skip, rollout) for how in ARRANGEMENTS]
+    return [train_sb3("collect", crane, *how, frame_skip, rollout) for how in ARRANGEMENTS]

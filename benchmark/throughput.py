@@ -4,20 +4,21 @@ One run on one machine; the cheap measurements take turns, so that a disturbance
 Last come the ratios that matter, each with a bar to pass and an aim.
 
     pip install -r benchmark/requirements.txt
-    python benchmark/throughput.py                      # a quarter of an hour; run nothing else
+    python benchmark/throughput.py                      # half an hour; run nothing else
     python benchmark/throughput.py --only physics env   # some parts
     python benchmark/throughput.py --quick              # does it work? its numbers mean nothing
 
 - physics: mujoco.mj_step alone, on the states that the shipped policy visits: the limit.
 - env: CraneVectorEnv driven by that policy, whose own time does not count.
-- vector: the same for Gymnasium's vector environments of `PlainCrane`, after a check that it is
-  the same task.
+- vector: the same for Gymnasium's vector environments of `NumpyCrane`, a one-crane environment
+  written as most are, and of `PlainCrane`, written for speed, after a check that both are the same
+  task.
 - memory: resident memory of CraneVectorEnv per crane.
-- training: iterations of our scripts and of SB3, from the second on, with the same network,
-  rollout, epochs and minibatch, TRPO's conjugate gradient over 1,024 decisions. SB3 has its fastest
-  arrangement of environments, RecurrentPPO also 64 at once, the better of 1 and 2 threads, no
-  monitor and no normalised observations; ours have their default threads, all epochs, and else
-  their defaults.
+- training: iterations of our scripts and of SB3, from the second on, in two rounds, with the same
+  network, rollout, epochs and minibatch, TRPO's conjugate gradient over 1,024 decisions. SB3 has
+  its fastest arrangement of PlainCrane (PPO also of NumpyCrane), RecurrentPPO also 64 at once, the
+  better of 1 and 2 threads, no monitor and no normalised observations; ours have their default
+  threads, all epochs, and else their defaults.
   It is the start of a training: no crane holds a log yet. "update" is what follows the rollout;
   ours contains values, log-probabilities and advantages, which SB3 computes before.
 """
@@ -34,6 +35,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -46,7 +48,7 @@ import numpy as np
 import torch
 import tyro
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from plain_crane import PlainCrane, disagreement
+from plain_crane import NumpyCrane, PlainCrane, disagreement
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
@@ -63,11 +65,14 @@ try:
 except ImportError as error:
     sys.exit(f"{error.name} is missing: pip install -r benchmark/requirements.txt")
 
+os.environ.pop("GOMP_SPINCOUNT", None)  # of our scripts, imported above; SB3 has torch's default
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "throughput.csv"
 PARTS = ("physics", "env", "vector", "memory", "training")
 HELD_STEPS = 20  # physics steps that an action of the policy holds, at any frame skip
 SCRIPTS = ("mppo_beta", "ppo", "trpo", "recurrent_ppo")
+PLAIN = (NumpyCrane, PlainCrane)
+JOBS = 13  # processes of training for a frame skip and round
 EPISODES = "mj_step, whole episodes"
 SAMPLING = 4.0  # s between two looks at the memory, which cost time
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all, with the solver's warm start
@@ -79,10 +84,11 @@ class Sizes(NamedTuple):
     cranes: tuple[int, ...]  # of CraneVectorEnv
     workers: tuple[int, ...]  # of Gymnasium's environments
     num_steps: int  # decisions per crane and rollout
+    rounds: int  # of all trainings
 
 
-FULL = Sizes(5, 90, (1, 16, 64, 256), (1, 2, 4, 8, 16), 128)  # 90 decisions: an episode
-QUICK = Sizes(2, 3, (1, 64), (1, 2), 8)
+FULL = Sizes(5, 90, (1, 16, 64, 256), (1, 2, 4, 8, 16), 128, 2)  # 90 decisions: an episode
+QUICK = Sizes(2, 3, (1, 64), (1, 2), 8, 1)
 
 
 class Result(NamedTuple):
@@ -208,11 +214,12 @@ def cheap_cells(parts: tuple[str, ...], sizes: Sizes, make_act: Callable, kwargs
                 add("env", env_name(n, threads, contact), skip, n, make)
         if "vector" in parts:
             same = {"autoreset_mode": AutoresetMode.SAME_STEP}  # as CraneVectorEnv
-            for n in sizes.workers:
-                envs = [partial(PlainCrane, skip)] * n
-                add("vector", f"SyncVectorEnv {n}", skip, n, partial(SyncVectorEnv, envs, **same))
+            for n, crane in product(sizes.workers, PLAIN):
+                envs, name = [partial(crane, skip)] * n, crane.__name__
+                make = partial(SyncVectorEnv, envs, **same)
+                add("vector", f"SyncVectorEnv {n} {name}", skip, n, make)
                 make = partial(AsyncVectorEnv, envs, context=sb3.START, **same)
-                add("vector", f"AsyncVectorEnv {n}", skip, n, make)
+                add("vector", f"AsyncVectorEnv {n} {name}", skip, n, make)
     return cells
 
 
@@ -296,38 +303,47 @@ def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, 
     return Training((rollout / seconds).tolist(), values, threads), peak
 
 
-def measure_training(results: Results, num_steps: int, bar: tqdm) -> None:
+def measure_training(results: Results, sizes: Sizes, bar: tqdm) -> None:
     def add(what: str, skip: int, training: Training, peak: float, note: str) -> None:
         note = f"{note}, torch threads {training.threads}"
-        results["training", what, skip] = Result("decisions/s", training.rates, note)
-        results["training", f"{what}, update", skip] = Result("s", training.updates)
-        results["memory", f"{what}, peak", skip] = Result("MB", [peak])
+        for key, unit, values, its_note in [
+            (("training", what, skip), "decisions/s", training.rates, note),
+            (("training", f"{what}, update", skip), "s", training.updates, ""),
+            (("memory", f"{what}, peak", skip), "MB", [peak], ""),
+        ]:
+            results.setdefault(key, Result(unit, [], its_note)).values.extend(values)
         bar.update()
 
-    rollout = CRANES * num_steps
-    for skip in (20, 1):
+    rollout, best = CRANES * sizes.num_steps, {}
+    for number, skip in product(range(sizes.rounds), (20, 1)):
         for script in SCRIPTS:
             bar.set_description(script)
-            training, peak = train_ours(script, skip, num_steps)
+            training, peak = train_ours(script, skip, sizes.num_steps)
             note = f"{CRANES} cranes, physics threads {THREADS}"
             add(f"{script}_crane.py", skip, training, peak, note)
-        bar.set_description("SB3's arrangements")
-        trials, _ = in_child(sb3.try_arrangements, skip, rollout // 4)
-        for (kind, n), trial in zip(sb3.ARRANGEMENTS, trials):
-            what = f"SB3 PPO collects, {kind}VecEnv {n}"
-            results["training", what, skip] = Result("decisions/s", trial.rates)
-        best = sb3.ARRANGEMENTS[np.argmax([np.median(trial.rates) for trial in trials])]
-        bar.update()
+        for crane in PLAIN:
+            bar.set_description("SB3's arrangements")
+            if number == 0:
+                trials, _ = in_child(sb3.try_arrangements, crane, skip, rollout // 4)
+                for (kind, n), trial in zip(sb3.ARRANGEMENTS, trials):
+                    what = f"SB3 PPO collects, {kind}VecEnv {n} {crane.__name__}"
+                    results["training", what, skip] = Result("decisions/s", trial.rates)
+                speeds = [np.median(trial.rates) for trial in trials]
+                best[crane, skip] = crane, *sb3.ARRANGEMENTS[np.argmax(speeds)]
+            bar.update()
+        fastest = best[PlainCrane, skip]
         for what, job in {
-            "SB3 PPO": ("PPO", *best, skip, rollout),
-            "SB3 PPO on CraneVectorEnv": ("PPO", "Crane", CRANES, skip, rollout),
-            "SB3 PPO as it comes": ("defaults", "Dummy", 1, skip, min(rollout, 2048)),
-            "SB3 TRPO": ("TRPO", *best, skip, rollout),
-            "SB3 RecurrentPPO": ("RecurrentPPO", *best, skip, rollout),
-            "SB3 RecurrentPPO, 64 at once": ("RecurrentPPO", "Dummy", 64, skip, rollout),
+            "SB3 PPO": ("PPO", *fastest),
+            "SB3 PPO on NumpyCrane": ("PPO", *best[NumpyCrane, skip]),
+            "SB3 PPO on CraneVectorEnv": ("PPO", CraneVectorEnv, "Crane", CRANES),
+            "SB3 PPO as it comes": ("defaults", PlainCrane, "Dummy", 1),
+            "SB3 TRPO": ("TRPO", *fastest),
+            "SB3 RecurrentPPO": ("RecurrentPPO", *fastest),
+            "SB3 RecurrentPPO, 64 at once": ("RecurrentPPO", PlainCrane, "Dummy", 64),
         }.items():
             bar.set_description(what)
-            add(what, skip, *in_child(sb3.train_sb3, *job), f"{job[1]}VecEnv {job[2]}")
+            training, peak = in_child(sb3.train_sb3, *job, skip, rollout)
+            add(what, skip, training, peak, f"{job[2]}VecEnv {job[3]}")
 
 
 # ---- reports
@@ -372,16 +388,20 @@ def ratios(results: Results) -> list[tuple[str, float, float, float]]:
 
     env, train = partial(median, "env", env_name()), partial(median, "training")
     limit = THREADS * median("physics", EPISODES)
-    vector = [median(*key) for key in results if key[0] == "vector" and key[2] == 1]
     found = [
         (f"env steps/s / {THREADS} x mj_step, skip 20", 20 * env(20) / limit, 0.95, 1.0),
         (f"env steps/s / {THREADS} x mj_step, skip 1", env(1) / limit, 0.6, 0.8),
-        ("env / Sync or AsyncVectorEnv, skip 1", env(1) / max(vector, default=np.nan), 4, 8),
     ]
+    for crane in PLAIN:
+        name = crane.__name__
+        keys = [key for key in results if key[0] == "vector" and key[1].endswith(name)]
+        rival = max((median(*key) for key in keys if key[2] == 1), default=np.nan)
+        found.append((f"env / Sync or AsyncVectorEnv of {name}, skip 1", env(1) / rival, 4, 8))
     ppo, trpo, recurrent = (f"{script}_crane.py" for script in ("ppo", "trpo", "recurrent_ppo"))
     recurrent_sb3 = ("SB3 RecurrentPPO", "SB3 RecurrentPPO, 64 at once")
     for one, others, bars in [
         (ppo, ("SB3 PPO",), {20: (1.8, 3), 1: (2, 4)}),
+        (ppo, ("SB3 PPO on NumpyCrane",), {20: (1.8, 3), 1: (2, 4)}),
         (ppo, ("SB3 PPO on CraneVectorEnv",), {20: (1.2, 2), 1: (1.2, 2)}),
         (trpo, ("SB3 TRPO",), {20: (1.5, 3), 1: (1.5, 3)}),
         (recurrent, recurrent_sb3, {20: (1.5, 3), 1: (1.5, 3)}),
@@ -409,16 +429,16 @@ def main() -> None:
     print(machine())
     make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic=False)
     if {"vector", "training"} & set(args.only):
-        for skip in (20, 1):
-            obs, reward = disagreement(make_act, kwargs, skip)
-            print(f"PlainCrane beside CraneVectorEnv, skip {skip}: apart by {max(obs, reward):.0e}")
-            if max(obs, reward) > 1e-3:
-                raise SystemExit("PlainCrane is another task than CraneVectorEnv")
+        for crane, skip in product(PLAIN, (20, 1)):
+            apart = max(disagreement(crane, make_act, kwargs, skip))
+            print(f"{crane.__name__} beside CraneVectorEnv, skip {skip}: apart by {apart:.0e}")
+            if apart > 1e-3:
+                raise SystemExit(f"{crane.__name__} is another task than CraneVectorEnv")
 
     results: Results = {}
     cells = cheap_cells(args.only, sizes, make_act, kwargs)
     total = sum(repetitions for _, repetitions, _ in cells.values())
-    total += ("memory" in args.only) + 22 * ("training" in args.only)
+    total += ("memory" in args.only) + 2 * sizes.rounds * JOBS * ("training" in args.only)
     with tqdm(total=total) as bar:
         for repetition in range(sizes.repetitions):
             for key, (unit, repetitions, run) in cells.items():
@@ -436,7 +456,7 @@ def main() -> None:
             results["memory", "per added crane", 20] = Result("MB", [slope])
             bar.update()
         if "training" in args.only:
-            measure_training(results, sizes.num_steps, bar)
+            measure_training(results, sizes, bar)
 
     rows = table(results)
     for part, what, skip, unit, *numbers, steps, note in rows:
