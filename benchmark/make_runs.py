@@ -1,7 +1,7 @@
 """Make the training runs behind the figures, two at a time with one thread each.
 
-    python benchmark/make_runs.py curves      # four algorithms, three seeds, the default budget
-    python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds, 0.6 M
+    python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
+    python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
     python benchmark/make_runs.py timed       # mPPO, three seeds, each alone with two threads
     python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of all but the ablations
 
@@ -67,6 +67,7 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
     else:
         command += ["--exp-name", run_name, "--seed", str(seed), *flags]
     with open(HERE / f"{run_name}_seed{seed}.log", "w") as log:
+        tqdm.write(f"{'resumed' if begun else 'started'} {run_name}, seed {seed}: {log.name}")
         code = subprocess.run(command, cwd=HERE, stdout=log, stderr=log).returncode
     if code:
         return f"{run_name}, seed {seed}: stopped, see {log.name}"

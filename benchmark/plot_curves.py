@@ -7,6 +7,7 @@ them below 95 %; minutes are those of rollouts and updates, without evaluations,
 """
 
 import csv
+import sys
 from pathlib import Path
 
 import matplotlib
@@ -175,6 +176,8 @@ def ablations(runs: dict[str, list[Run]]) -> None:
 
 def main() -> None:
     curves = read("curves")
+    if not curves:
+        sys.exit("benchmark/curves has no CSV: benchmark/make_runs.py curves makes them")
     learning_curves(curves)
     print_times("curves", curves)
     print_times("timed", read("timed"))
