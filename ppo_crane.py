@@ -31,7 +31,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-os.environ.setdefault("GOMP_SPINCOUNT", "5000")  # spinning for longer, two runs at once would stall
+os.environ.setdefault("GOMP_SPINCOUNT", "5000")  # looks before a waiting thread sleeps
 
 import gymnasium
 import numpy as np

@@ -1,6 +1,7 @@
 """One crane in plain MuJoCo calls: what throughput.py gives to Gymnasium and Stable-Baselines3.
 
-`NumpyCrane` is written as most environments are, `PlainCrane` for speed.
+`NumpyCrane` computes observation, reward and rules as is usual, with NumPy on small arrays,
+`PlainCrane` without NumPy, for speed. Their engine calls are the same.
 """
 
 import sys
@@ -155,7 +156,7 @@ class PlainCrane(gymnasium.Env):
 
 
 class NumpyCrane(PlainCrane):
-    """PlainCrane with NumPy on small arrays."""
+    """PlainCrane with command, observation, reward and limits in NumPy on small arrays."""
 
     def __init__(self, frame_skip: int = 20):
         super().__init__(frame_skip)

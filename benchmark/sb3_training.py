@@ -28,10 +28,16 @@ ARRANGEMENTS = [("Dummy", n) for n in (1, 16, 64)] + [("Subproc", n) for n in (2
 START = "fork" if sys.platform == "linux" else None  # workers that start fast and share memory
 
 
-class Training(NamedTuple):
-    rates: list[float]  # decisions/s of each iteration
-    updates: list[float]  # s, the part of the iteration after its rollout
-    threads: int = 1  # of torch
+class Iteration(NamedTuple):
+    rate: float  # decisions/s
+    update: float  # s, what follows the rollout
+    threads: int  # of torch
+
+
+def with_better_threads(iterations: list[Iteration]) -> list[Iteration]:
+    """Those of the number of threads that was faster in the median."""
+    groups = {i.threads: [j for j in iterations if j.threads == i.threads] for i in iterations}
+    return max(groups.values(), key=lambda group: np.median([i.rate for i in group]))
 
 
 class CranesForSB3(VecEnv):
@@ -74,30 +80,30 @@ class CranesForSB3(VecEnv):
 
 
 class Stopwatch(BaseCallback):
-    """Times SB3: an iteration to warm up, one with 1 and one with 2 threads, on with the better."""
+    """Times SB3's iterations after one to warm up, with 2 and with 1 threads by turns."""
 
-    def __init__(self) -> None:
+    def __init__(self, rollout: int) -> None:
         super().__init__()
-        self.iterations: list[tuple[float, float, int]] = []  # s in all, s of update, threads
-        self.started = False
+        self.rollout, self.count = rollout, 0
+        self.iterations: list[Iteration] = []
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
         self._on_training_end()
-        timed = self.iterations[1:]
-        torch.set_num_threads(2 if len(timed) == 1 else min(timed)[2] if timed else 1)
-        self.start, self.started = time.perf_counter(), True
+        torch.set_num_threads(1 + self.count % 2)
+        self.count += 1
+        self.start = time.perf_counter()
 
     def _on_rollout_end(self) -> None:
         self.update_start = time.perf_counter()
 
     def _on_training_end(self) -> None:
-        if self.started:
+        if self.count > 1:
             now = time.perf_counter()
-            times = now - self.start, now - self.update_start
-            self.iterations.append((*times, torch.get_num_threads()))
+            rate, update = self.rollout / (now - self.start), now - self.update_start
+            self.iterations.append(Iteration(rate, update, torch.get_num_threads()))
 
 
 class CollectOnly(stable_baselines3.PPO):
@@ -107,8 +113,8 @@ class CollectOnly(stable_baselines3.PPO):
 
 def train_sb3(
     algorithm: str, crane: type, kind: str, n: int, frame_skip: int, rollout: int
-) -> Training:
-    """Five iterations of SB3 on n of `crane`, those with the better number of threads."""
+) -> list[Iteration]:
+    """Four iterations of SB3 on n of `crane`."""
     rollout = min(rollout, 2048) if algorithm == "defaults" else rollout  # theirs
     makers = [partial(crane, frame_skip)] * n
     if kind == "Subproc":
@@ -133,14 +139,12 @@ def train_sb3(
     elif algorithm == "RecurrentPPO":  # one memory, as ours; its networks do not see obs beside it
         maker, network = sb3_contrib.RecurrentPPO, "MlpLstmPolicy"
         policy |= {"lstm_hidden_size": LSTM, "shared_lstm": True, "enable_critic_lstm": False}
-    stopwatch = Stopwatch()
+    stopwatch = Stopwatch(rollout)
     maker(network, envs, **options).learn(5 * rollout, stopwatch)
     envs.close()
-    threads = torch.get_num_threads()
-    chosen = [i for i in stopwatch.iterations[1:] if i[2] == threads]
-    return Training([rollout / i[0] for i in chosen], [i[1] for i in chosen], threads)
+    return stopwatch.iterations
 
 
-def try_arrangements(crane: type, frame_skip: int, rollout: int) -> list[Training]:
+def try_arrangements(crane: type, frame_skip: int, rollout: int) -> list[list[Iteration]]:
     """SB3's PPO that only collects, in each of ARRANGEMENTS."""
     return [train_sb3("collect", crane, *how, frame_skip, rollout) for how in ARRANGEMENTS]

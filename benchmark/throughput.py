@@ -10,15 +10,15 @@ Last come the ratios that matter, each with a bar to pass and an aim.
 
 - physics: mujoco.mj_step alone, on the states that the shipped policy visits: the limit.
 - env: CraneVectorEnv driven by that policy, whose own time does not count.
-- vector: the same for Gymnasium's vector environments of `NumpyCrane`, a one-crane environment
-  written as most are, and of `PlainCrane`, written for speed, after a check that both are the same
-  task.
+- vector: the same for Gymnasium's vector environments of `NumpyCrane`, a one-crane environment with
+  NumPy on small arrays, and of `PlainCrane`, without, after a check that both are the same task.
 - memory: resident memory of CraneVectorEnv per crane.
 - training: iterations of our scripts and of SB3, from the second on, in two rounds, with the same
   network, rollout, epochs and minibatch, TRPO's conjugate gradient over 1,024 decisions. SB3 has
-  its fastest arrangement of PlainCrane (PPO also of NumpyCrane), RecurrentPPO also 64 at once, the
-  better of 1 and 2 threads, no monitor and no normalised observations; ours have their default
-  threads, all epochs, and else their defaults.
+  the arrangement of PlainCrane (PPO also of NumpyCrane) in which its PPO collects fastest,
+  RecurrentPPO also 64 at once, the better of 1 and 2 threads, torch's own settings of them, no
+  monitor and no normalised observations; ours have their default threads, all epochs, and else
+  their defaults.
   It is the start of a training: no crane holds a log yet. "update" is what follows the rollout;
   ours contains values, log-probabilities and advantages, which SB3 computes before.
 """
@@ -61,7 +61,7 @@ try:
     import sb3_contrib
     import sb3_training as sb3
     import stable_baselines3
-    from sb3_training import CRANES, EPOCHS, LSTM, MINIBATCHES, NETWORK, SEED, THREADS, Training
+    from sb3_training import CRANES, EPOCHS, LSTM, MINIBATCHES, NETWORK, SEED, THREADS, Iteration
 except ImportError as error:
     sys.exit(f"{error.name} is missing: pip install -r benchmark/requirements.txt")
 
@@ -72,7 +72,7 @@ PARTS = ("physics", "env", "vector", "memory", "training")
 HELD_STEPS = 20  # physics steps that an action of the policy holds, at any frame skip
 SCRIPTS = ("mppo_beta", "ppo", "trpo", "recurrent_ppo")
 PLAIN = (NumpyCrane, PlainCrane)
-JOBS = 13  # processes of training for a frame skip and round
+JOBS = 11  # processes of training for a frame skip and round
 EPISODES = "mj_step, whole episodes"
 SAMPLING = 4.0  # s between two looks at the memory, which cost time
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all, with the solver's warm start
@@ -270,7 +270,7 @@ def resident_mb(num_envs: int) -> float:
     return psutil.Process().memory_info().rss / 2**20
 
 
-def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, float]:
+def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[list[Iteration], float]:
     """Iterations 2 to 4 of one of our scripts, and its peak memory in MB."""
     rollout = CRANES * num_steps
     threads = eval_crane.ALGORITHMS[script].Args().torch_threads
@@ -300,36 +300,39 @@ def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[Training, 
     updates = events.Scalars("time/update")
     seconds = np.diff([event.wall_time for event in updates])
     values = [event.value for event in updates[1:]]
-    return Training((rollout / seconds).tolist(), values, threads), peak
+    return [Iteration(rollout / s, value, threads) for s, value in zip(seconds, values)], peak
 
 
 def measure_training(results: Results, sizes: Sizes, bar: tqdm) -> None:
-    def add(what: str, skip: int, training: Training, peak: float, note: str) -> None:
-        note = f"{note}, torch threads {training.threads}"
-        for key, unit, values, its_note in [
-            (("training", what, skip), "decisions/s", training.rates, note),
-            (("training", f"{what}, update", skip), "s", training.updates, ""),
-            (("memory", f"{what}, peak", skip), "MB", [peak], ""),
-        ]:
-            results.setdefault(key, Result(unit, [], its_note)).values.extend(values)
+    trained: dict[tuple[str, int], list[Iteration]] = {}
+
+    def add(what: str, skip: int, iterations: list[Iteration], peak: float, note: str) -> None:
+        trained.setdefault((what, skip), []).extend(iterations)
+        chosen = sb3.with_better_threads(trained[what, skip])
+        note = f"{note}, torch threads {chosen[0].threads}"
+        rates, updates = [i.rate for i in chosen], [i.update for i in chosen]
+        results["training", what, skip] = Result("decisions/s", rates, note)
+        results["training", f"{what}, update", skip] = Result("s", updates)
+        results.setdefault(("memory", f"{what}, peak", skip), Result("MB", [])).values.append(peak)
         bar.update()
 
     rollout, best = CRANES * sizes.num_steps, {}
     for number, skip in product(range(sizes.rounds), (20, 1)):
         for script in SCRIPTS:
             bar.set_description(script)
-            training, peak = train_ours(script, skip, sizes.num_steps)
+            iterations, peak = train_ours(script, skip, sizes.num_steps)
             note = f"{CRANES} cranes, physics threads {THREADS}"
-            add(f"{script}_crane.py", skip, training, peak, note)
-        for crane in PLAIN:
+            add(f"{script}_crane.py", skip, iterations, peak, note)
+        for crane in PLAIN if number == 0 else ():
             bar.set_description("SB3's arrangements")
-            if number == 0:
-                trials, _ = in_child(sb3.try_arrangements, crane, skip, rollout // 4)
-                for (kind, n), trial in zip(sb3.ARRANGEMENTS, trials):
-                    what = f"SB3 PPO collects, {kind}VecEnv {n} {crane.__name__}"
-                    results["training", what, skip] = Result("decisions/s", trial.rates)
-                speeds = [np.median(trial.rates) for trial in trials]
-                best[crane, skip] = crane, *sb3.ARRANGEMENTS[np.argmax(speeds)]
+            trials, _ = in_child(sb3.try_arrangements, crane, skip, rollout // 4)
+            speeds = []
+            for (kind, n), trial in zip(sb3.ARRANGEMENTS, trials):
+                rates = [i.rate for i in sb3.with_better_threads(trial)]
+                what = f"SB3 PPO collects, {kind}VecEnv {n} {crane.__name__}"
+                results["training", what, skip] = Result("decisions/s", rates)
+                speeds.append(np.median(rates))
+            best[crane, skip] = crane, *sb3.ARRANGEMENTS[np.argmax(speeds)]
             bar.update()
         fastest = best[PlainCrane, skip]
         for what, job in {
@@ -342,8 +345,8 @@ def measure_training(results: Results, sizes: Sizes, bar: tqdm) -> None:
             "SB3 RecurrentPPO, 64 at once": ("RecurrentPPO", PlainCrane, "Dummy", 64),
         }.items():
             bar.set_description(what)
-            training, peak = in_child(sb3.train_sb3, *job, skip, rollout)
-            add(what, skip, training, peak, f"{job[2]}VecEnv {job[3]}")
+            iterations, peak = in_child(sb3.train_sb3, *job, skip, rollout)
+            add(what, skip, iterations, peak, f"{job[2]}VecEnv {job[3]}")
 
 
 # ---- reports
@@ -438,7 +441,8 @@ def main() -> None:
     results: Results = {}
     cells = cheap_cells(args.only, sizes, make_act, kwargs)
     total = sum(repetitions for _, repetitions, _ in cells.values())
-    total += ("memory" in args.only) + 2 * sizes.rounds * JOBS * ("training" in args.only)
+    total += "memory" in args.only
+    total += 2 * (sizes.rounds * JOBS + len(PLAIN)) * ("training" in args.only)
     with tqdm(total=total) as bar:
         for repetition in range(sizes.repetitions):
             for key, (unit, repetitions, run) in cells.items():
