@@ -36,6 +36,7 @@ learns to lift and a long one takes time over its grip. The critic's step size f
 """
 
 import os
+import signal
 import sys
 import time
 from collections import deque
@@ -78,7 +79,7 @@ class Args:
     # --- environment
     env_id: str = "ForestryCrane-v0"  # or any Gymnasium task with flat Box spaces
     num_envs: int = 64  # cranes simulated side by side
-    env_threads: int = 2  # physics threads
+    env_threads: int = 2  # physics threads, 0 for all cores
     frame_skip: int = 20  # physics steps of 5 ms per decision
     contact: Literal["primitive", "sdf"] = "primitive"  # contact model of jaws and log
     reward: Literal["staged", "paper"] = "staged"  # staged, or as printed in the paper
@@ -465,6 +466,15 @@ if __name__ == "__main__":
     recent_success = deque(maxlen=200)
     start_time = time.time()
 
+    stopping = False
+
+    def stop_after_update(*_) -> None:
+        """Ctrl-C, which anywhere else may leave the writer's locks broken; again stops at once."""
+        global stopping
+        stopping = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, stop_after_update)
     completed = first_iteration - 1
     progress = trange(first_iteration, num_iterations + 1, initial=completed, total=num_iterations)
     try:
@@ -609,6 +619,9 @@ if __name__ == "__main__":
             if args.eval_every and (iteration % args.eval_every == 0 or last):
                 for name, value in evaluate(agent, args, args.eval_trials).items():
                     writer.add_scalar(name, value, global_step)
+            if stopping:
+                raise KeyboardInterrupt
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         progress.close()
         if args.final_trials:
             for name, value in evaluate(agent, args, args.final_trials).items():

@@ -1,8 +1,8 @@
-"""Make the training runs behind the figures, two at a time with one thread each.
+"""Make the training runs behind the figures: two at a time with one thread each, or one (timed).
 
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
-    python benchmark/make_runs.py timed       # mPPO, three seeds, each alone with two threads
+    python benchmark/make_runs.py timed       # mPPO, three seeds, one at a time; half an hour
     python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of all but the ablations
 
 Run it again to go on: what has a CSV in benchmark/curves/, ablations/ or timed/ is done, what was
@@ -14,7 +14,7 @@ import csv
 import json
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from subprocess import PIPE
 from typing import Literal
@@ -56,8 +56,6 @@ ABLATIONS = {
 def make(folder: str, script: str, name: str, seed: int, flags: list[str], threads: int) -> str:
     """Train (or go on) and export; what happened, in a line."""
     csv_path = HERE / folder / f"{name}_seed{seed}.csv"
-    if csv_path.exists():
-        return f"{csv_path.name} is there"
     command = [sys.executable, str(HERE.parent / f"{script}.py")]
     command += ["--torch-threads", str(threads), "--env-threads", str(threads)]
     run_name = f"{folder}_{name}"
@@ -66,7 +64,7 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
         command += ["--resume", str(begun[-1].parent)]
     else:
         command += ["--exp-name", run_name, "--seed", str(seed), *flags]
-    with open(HERE / f"{run_name}_seed{seed}.log", "w") as log:
+    with open(HERE / f"{run_name}_seed{seed}.log", "a") as log:
         tqdm.write(f"{'resumed' if begun else 'started'} {run_name}, seed {seed}: {log.name}")
         code = subprocess.run(command, cwd=HERE, stdout=log, stderr=log).returncode
     if code:
@@ -78,28 +76,34 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
 
 
 def evaluate() -> None:
-    """Write evaluations.csv anew: success [%] of all runs that are there, by diameter."""
-    rows = []
-    names = [*(f"curves_{script}" for script in SCRIPTS), f"timed_{SCRIPTS[0]}"]
-    for name in tqdm(names):
-        for policy in sorted(HERE.glob(f"runs/*__{name}__*/policy.pt")):
+    """Success [%] of all finished runs that are there, by diameter, into evaluations.csv."""
+    path, rows = HERE / "evaluations.csv", {}
+    if path.exists():
+        with open(path) as file:  # runs that are not there keep their rows
+            rows = {tuple(row.values())[:3]: row for row in csv.DictReader(file)}
+    policies = []
+    for folder, script in [*(("curves", name) for name in SCRIPTS), ("timed", SCRIPTS[0])]:
+        for policy in sorted(HERE.glob(f"runs/*__{folder}_{script}__*/policy.pt")):
             seed = policy.parent.name.split("__")[2]
-            for noise in ("none", "step"):
-                command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(policy)]
-                command += ["--json", "--pose-noise", noise]
-                result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
-                row = {"run": name, "seed": seed, "pose_noise": noise}
-                for cell in result["cells"]:
-                    row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
-                rows.append(row | {"mean": round(100 * result["mean_success_rate"], 2)})
-    if not rows:
+            if (HERE / folder / f"{script}_seed{seed}.csv").exists():  # finished
+                policies.append((f"{folder}_{script}", seed, policy))
+    if not policies:
         sys.exit(
             "benchmark/runs has no policies: delete CSVs of curves/ and timed/ and make those runs"
         )
-    with open(HERE / "evaluations.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
+    for name, seed, policy in tqdm(policies):
+        for noise in ("none", "step"):
+            command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(policy)]
+            command += ["--json", "--pose-noise", noise]
+            result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
+            row = {"run": name, "seed": seed, "pose_noise": noise}
+            for cell in result["cells"]:
+                row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
+            rows[name, seed, noise] = row | {"mean": round(100 * result["mean_success_rate"], 2)}
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, next(iter(rows.values())))
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(rows.values())
 
 
 def main(what: Positional[Literal["curves", "ablations", "timed", "evaluate"]]) -> None:
@@ -117,11 +121,13 @@ def main(what: Positional[Literal["curves", "ablations", "timed", "evaluate"]]) 
             for seed in (1, 2)
             for name, (script, flags) in ABLATIONS.items()
         ]
-    failed = False
+    missing = [job for job in jobs if not (HERE / what / f"{job[1]}_seed{job[2]}.csv").exists()]
+    done, failed = len(jobs) - len(missing), False
     with ThreadPoolExecutor(1 if what == "timed" else 2) as pool:
-        for line in tqdm(pool.map(lambda job: make(what, *job), jobs), total=len(jobs)):
-            tqdm.write(line)
-            failed |= "stopped" in line
+        runs = [pool.submit(make, what, *job) for job in missing]
+        for run in tqdm(as_completed(runs), total=len(jobs), initial=done):
+            tqdm.write(run.result())
+            failed |= "stopped" in run.result()
     sys.exit(failed)
 
 

@@ -466,8 +466,12 @@ def main() -> None:
     for part, what, skip, unit, *numbers, steps, note in rows:
         print(f"{part:<8} {what:<50} {skip:>4} {unit:<11}", *(f"{x:>9}" for x in numbers), end=" ")
         print(f"{steps:>8}  {note}")
-    print(f"\n{'ratio':<60} {'value':>6} {'bar':>5} {'aim':>5}")
-    for name, value, bar, aim in ratios(results):
+    found = ratios(results)
+    if found:
+        print(f"\n{'ratio':<60} {'value':>6} {'bar':>5} {'aim':>5}")
+    else:
+        print("\nno ratio without physics and env, env and vector, training, or memory")
+    for name, value, bar, aim in found:
         reached = [value <= x if aim < bar else value >= x for x in (aim, bar)]
         verdict = "aim met" if reached[0] else "bar met" if reached[1] else "MISSED"
         print(f"{name:<60} {value:>6.2f} {bar:>5} {aim:>5}  {verdict}")
