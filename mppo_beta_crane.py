@@ -34,7 +34,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-os.environ.setdefault("GOMP_SPINCOUNT", "5000")  # looks before a waiting thread sleeps
+# Waiting threads look 5,000 times, then sleep: fast alone, and two runs at once do not stall.
+os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 import gymnasium
 import numpy as np
@@ -397,11 +398,10 @@ if __name__ == "__main__":
     next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
     recent_success = deque(maxlen=200)
     start_time = time.time()
-
     stopping = False
 
     def stop_after_update(*_) -> None:
-        """Ctrl-C, which anywhere else may leave the writer's locks broken; again stops at once."""
+        """Ctrl-C: end after this update, as in the writer it may break a lock; twice: at once."""
         global stopping
         stopping = True
         signal.signal(signal.SIGINT, signal.default_int_handler)

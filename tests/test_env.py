@@ -3,6 +3,7 @@
 import re
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -132,6 +133,18 @@ def test_one_crane_env_is_the_vector_env():
         assert isinstance(info["termination"], str)
         if terminated or truncated:
             break
+
+
+@pytest.mark.parametrize("frame_skip", [1, 3, 7, 20])
+def test_sensors_describe_the_state_after_the_step(frame_skip):
+    envs, rng = CraneVectorEnv(2, frame_skip=frame_skip), np.random.default_rng(0)
+    envs.reset(seed=0)
+    for _ in range(8):
+        envs.advance(random_actions(rng, 2))
+        for i in range(2):
+            model, data = envs.batch.get_model(i), envs.batch.get_data(i)
+            mujoco.mj_forward(model, data)
+            assert np.array_equal(envs._sensors[i], data.sensordata)
 
 
 def test_frame_skip_changes_the_decisions_not_the_physics():
