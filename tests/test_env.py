@@ -429,7 +429,6 @@ def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
 
 
 def test_render():
-    mujoco = pytest.importorskip("mujoco")
     try:
         mujoco.Renderer(crane_env.load_model(), 8, 8).close()
     except Exception as error:
