@@ -204,10 +204,11 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
-    axis, log = state.grapple_axis[:, :2], state.log_axis[:, :2]
-    log = log / np.maximum(np.linalg.norm(log, axis=-1, keepdims=True), 1e-9)
-    dot = np.sum(axis * log, axis=-1)
-    cross = axis[:, 0] * log[:, 1] - axis[:, 1] * log[:, 0]
+    (grapple_x, grapple_y, _), (log_x, log_y, _) = state.grapple_axis.T, state.log_axis.T
+    level = np.maximum(np.sqrt(log_x**2 + log_y**2), 1e-9)
+    log_x, log_y = log_x / level, log_y / level
+    dot = grapple_x * log_x + grapple_y * log_y
+    cross = grapple_x * log_y - grapple_y * log_x
     signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
     slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
     slew = (slew + np.pi) % (2 * np.pi) - np.pi
@@ -236,13 +237,21 @@ def centre_miss(state: CraneState) -> Array:
 
 
 def reward_terms(
-    state: CraneState, d_combine: Array, command: Array, kind: str = "staged", omega2: float = 1.0
+    state: CraneState,
+    d_combine: Array,
+    clearance: Array,
+    miss: Array,
+    command: Array,
+    kind: str = "staged",
+    omega2: float = 1.0,
 ) -> Array:
-    """The four terms r_distance, r_grapple, r_lift, r_balance, (N, 4); the reward is their sum.
+    """The four terms r_distance, r_grapple, r_lift, r_balance, (4, N); the reward is their sum.
 
-    d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, command (N, 6) the commanded velocities in
-    rad/s and m/s. kind "paper" is Sec. III-A2 as printed. "staged" (why: README, errata) pays
-    r_grapple and r_lift near the log's centre, r_balance while both jaws hold it off the ground.
+    d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
+    `log_clearance` and `centre_miss`, command (N, 6) the velocities in rad/s and m/s.
+
+    kind "paper" is Sec. III-A2 as printed. "staged" (why: README, errata) pays r_grapple and r_lift
+    near the log's centre, r_balance while both jaws hold it off the ground.
     """
     r_distance = np.exp(-omega2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -253,14 +262,14 @@ def reward_terms(
         r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
     else:
         near = np.minimum(1, np.exp(-3 * omega2 * (d_combine - REACH_DISTANCE)))
-        off_centre = (centre_miss(state) / CENTRED) ** 2
+        off_centre = (miss / CENTRED) ** 2
         r_grapple = 2 * near * np.exp(-off_centre / 4) * closed
-        clearance = np.maximum(log_clearance(state), 1e-9)  # 0 on the ground; best is 1 m
+        clearance = np.maximum(clearance, 1e-9)  # 0 on the ground; best is 1 m
         lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
         held = state.touching.all(axis=-1)
         r_lift, r_balance = 2 * lift, 3 * calm * held * lift
-    return np.stack([r_distance, r_grapple, r_lift, r_balance], axis=-1)
+    return np.array([r_distance, r_grapple, r_lift, r_balance])
 
 
 def termination_rule(
@@ -284,19 +293,23 @@ def termination_rule(
     return np.array([*TERMINATIONS, "none"])[np.argmax(rules, axis=0)]
 
 
-def success_conditions(reached: Array, clearance: Array, touching: Array, miss: Array) -> dict:
+def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:
+    """Whether the log is lifted, held by both jaws, held near its centre: (3, N) bool.
+
+    clearance and miss (N,) in m, touching (N, 2).
+    """
+    return np.array([clearance >= MIN_CLEARANCE, touching.all(axis=-1), miss <= MAX_MISS])
+
+
+def success_conditions(reached: Array, kept: Array) -> dict[str, Array]:
     """The one definition of success, for training, evaluation and tests: (N,) bool each.
 
-    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. clearance and miss (N, W)
-    in m, touching (N, W, 2): at the W decisions of the last HOLD_TIME of a whole episode.
+    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. kept (3, N): which of
+    `grip_conditions` held at every decision of the last HOLD_TIME of a whole episode.
     """
-    failed = {
-        "not_reached": ~reached,
-        "not_lifted": (clearance < MIN_CLEARANCE).any(axis=-1),
-        "not_held": ~touching.all(axis=(-2, -1)),
-        "off_centre": (miss > MAX_MISS).any(axis=-1),
-    }
-    return {"success": ~np.any(list(failed.values()), axis=0), **failed}
+    names = ("not_reached", "not_lifted", "not_held", "off_centre")
+    failed = dict(zip(names, ~np.array([reached, *kept])))
+    return {"success": reached & kept.all(axis=0), **failed}
 
 
 def monte_carlo_trials(
@@ -388,13 +401,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         self.dt = self.frame_skip * TIMESTEP
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
-        window = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
+        self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
         draws = self.max_decisions + 1 if pose_noise == "step" else 1
         self._decisions = np.zeros(self.num_envs, int)
         self._reach_time = np.full(self.num_envs, np.inf)
-        # of the last `window` decisions, written in turn, for `success_conditions`
-        self._clearance, self._miss = np.zeros((2, self.num_envs, window))
-        self._touching = np.zeros((self.num_envs, window, 2), bool)
+        self._streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
         self._noise = np.zeros((self.num_envs, draws, 2))  # epsilon; "none" never reads it
         self._rngs: list[tuple[Generator, Generator]] | None = None
         self._starts: list[tuple] = [()] * self.num_envs
@@ -456,14 +467,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         near = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
         self._reach_time = np.minimum(self._reach_time, np.where(near, time, np.inf))
         reached = np.isfinite(self._reach_time)
-        slot = np.arange(self.num_envs), self._decisions % self._clearance.shape[1]
-        self._clearance[slot], self._touching[slot] = info["clearance"], state.touching
-        self._miss[slot] = info["centre_miss"]
+        gripped = grip_conditions(info["clearance"], state.touching, info["centre_miss"])
+        self._streaks = (self._streaks + 1) * gripped
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         truncated = ending == "time_limit"
         terminated = (ending != "none") & ~truncated
-        conditions = success_conditions(reached, self._clearance, self._touching, self._miss)
+        conditions = success_conditions(reached, self._streaks >= self.hold_decisions)
         conditions["success"] &= truncated
         info |= conditions | {"termination": ending, "time_to_reach": self._reach_time.copy()}
         reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
@@ -534,33 +544,33 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load / self._servo_kp
         self._decisions[ids] = 0
         self._reach_time[ids] = np.inf
+        self._streaks[:, ids] = 0
 
     def _state(self) -> CraneState:
-        # in the order of the sensors in crane.xml
-        centre, axis, log_centre, log_axis, touch = np.split(
-            self._sensors.copy(), [3, 6, 9, 12], axis=-1
-        )
         q, dq, diameter = self._qpos[:, self._q], self._qvel[:, self._dq], 2 * self._log_size[:, 0]
-        return CraneState(q, dq, centre, axis, log_centre, log_axis, touch > 0, diameter)
+        s = self._sensors.copy()  # in their order in crane.xml; the last two are of touch
+        poses = s[:, :3], s[:, 3:6], s[:, 6:9], s[:, 9:12]
+        return CraneState(q, dq, *poses, s[:, 12:] > 0, diameter)
 
     def _observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
         """Observations (N, 18), float32, inside the observation space; what `info` says of them."""
         delta_p, delta_psi, signed_angle = relative_pose(state, self.offset)
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
-        terms = reward_terms(state, d_combine, command, self.reward, self.omega2)
-        info = dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms.T))
-        info |= {"d_combine": d_combine, "clearance": log_clearance(state)}
-        info["centre_miss"] = centre_miss(state)
+        clearance, miss = log_clearance(state), centre_miss(state)
+        terms = reward_terms(state, d_combine, clearance, miss, command, self.reward, self.omega2)
+        info = dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms))
+        info |= {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
         angle = signed_angle if self.signed_yaw else delta_psi
         if self.pose_noise != "none":
             now = np.minimum(self._decisions, self._noise.shape[1] - 1)
             delta_p, angle = noisy_pose(delta_p, angle, self._noise[np.arange(len(now)), now])
         if self.axes == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
-            delta_p = np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
+            delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
         obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
+        obs[np.isnan(obs)] = 0  # of a crane that diverged
         space = self.single_observation_space
-        return np.clip(np.nan_to_num(obs), space.low, space.high).astype(np.float32), info
+        return np.clip(obs, space.low, space.high).astype(np.float32), info
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""

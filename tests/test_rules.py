@@ -100,52 +100,56 @@ def test_clearance_and_miss():
 COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaws, 1.3 with them
 
 
+def reward_terms(state, d_combine, *args, **kwargs):
+    """The four terms of one crane."""
+    measured = crane_env.log_clearance(state), crane_env.centre_miss(state)
+    return crane_env.reward_terms(state, np.array([d_combine]), *measured, *args, **kwargs)[:, 0]
+
+
 def test_staged_reward():
     lifted = {"log_centre": [4.0, 6.0, 0.45], "grapple_centre": [4.3, 6.125, 0.8]}
-    terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
+    terms = reward_terms(state(**lifted), 0.4, COMMAND, omega2=2.0)
     r, grasp = np.exp(-0.8), 2 * 0.5 * np.exp(-0.3)  # q8 / 3 = 0.5; 0.05 m farther than 0.35 m
     # 0.125 m off the centre, half of 0.25 m and a quarter of 0.5 m; clearance 0.45 - 0.2 = 0.5^2
     centred, calm = np.exp(-0.25), 1 - np.tanh(0.5)
     lift = 0.5 * centred
-    np.testing.assert_allclose(terms, [[r, grasp * np.exp(-0.0625), 2 * lift, 3 * calm * lift]])
-    farther = crane_env.reward_terms(state(**lifted), np.array([0.9]), COMMAND, omega2=2.0)
-    assert np.all(farther[0, :2] < terms[0, :2])
-    np.testing.assert_array_equal(farther[0, 2:], terms[0, 2:])  # a lift is worth as much anywhere
+    np.testing.assert_allclose(terms, [r, grasp * np.exp(-0.0625), 2 * lift, 3 * calm * lift])
+    farther = reward_terms(state(**lifted), 0.9, COMMAND, omega2=2.0)
+    assert np.all(farther[:2] < terms[:2])
+    np.testing.assert_array_equal(farther[2:], terms[2:])  # a lift is worth as much anywhere
     for height in (0.2, 0.15):  # on the ground, and pressed into it
         down = state(log_centre=[4.0, 6.0, height], grapple_centre=[4.0, 6.0, 0.4])
-        terms = crane_env.reward_terms(down, np.array([0.4]), COMMAND)
-        np.testing.assert_allclose(terms[0, 2:], 0, atol=2e-4)
+        terms = reward_terms(down, 0.4, COMMAND)
+        np.testing.assert_allclose(terms[2:], 0, atol=2e-4)
     lifted["grapple_centre"] = [4.0, 7.0, 0.45]  # 1 m off
-    terms = crane_env.reward_terms(state(**lifted), np.array([0.4]), COMMAND, omega2=2.0)
-    np.testing.assert_allclose(terms, [[r, grasp * np.exp(-4), 0.0, 0.0]], atol=1e-6)
+    terms = reward_terms(state(**lifted), 0.4, COMMAND, omega2=2.0)
+    np.testing.assert_allclose(terms, [r, grasp * np.exp(-4), 0.0, 0.0], atol=1e-6)
     one_jaw = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[True, False])
-    terms = crane_env.reward_terms(one_jaw, np.array([0.4]), COMMAND, omega2=2.0)
-    np.testing.assert_allclose(terms, [[r, grasp, 2 * 0.5, 0.0]])
+    terms = reward_terms(one_jaw, 0.4, COMMAND, omega2=2.0)
+    np.testing.assert_allclose(terms, [r, grasp, 2 * 0.5, 0.0])
     for clearance, expected in [(1.0, 2.0), (2.25, 2 / 1.5), (4.0, 1.0)]:  # 1 m is best
         high = state(log_centre=[4, 6, 0.2 + clearance], grapple_centre=[4.0, 6.0, 3.2])
-        terms = crane_env.reward_terms(high, np.array([0.34]), COMMAND)
-        np.testing.assert_allclose(terms[0, 2], expected)
-    np.testing.assert_allclose(terms[0, 1], 1.0)  # nearer than 0.35 m is no better for r_grapple
+        terms = reward_terms(high, 0.34, COMMAND)
+        np.testing.assert_allclose(terms[2], expected)
+    np.testing.assert_allclose(terms[1], 1.0)  # nearer than 0.35 m is no better for r_grapple
 
 
 def test_paper_reward():
-    terms = crane_env.reward_terms(
-        state(log_centre=[4.0, 6.0, 0.7]), np.array([0.25]), COMMAND, "paper", 2.0
-    )
+    terms = reward_terms(state(log_centre=[4.0, 6.0, 0.7]), 0.25, COMMAND, "paper", 2.0)
     r = np.exp(-0.5)
     grapple = 0.5 * r + 0.5 * (1 - r)
     lift = (1 - np.tanh(0.3)) * (1 - grapple)
     balance = (1 - np.tanh(1.3)) * (1 - lift)
-    np.testing.assert_allclose(terms, [[r, grapple, lift, balance]])
+    np.testing.assert_allclose(terms, [r, grapple, lift, balance])
 
 
 def test_printed_reward_pays_for_standing_still():
     """Why "staged" is the default: open jaws at rest earn the same at any distance."""
     still, open_jaws = np.zeros((1, 6)), np.array([0, 0.5, 0.2, 0.5, 0.87, np.pi / 2, 0, 0.0])
     for d in (0.1, 5.0):
-        terms = crane_env.reward_terms(state(q=open_jaws), np.array([d]), still, "paper")
-        np.testing.assert_allclose(terms[0, 0] + terms[0, 1], 1.0)
-        assert terms[0, 3] > 0.6
+        terms = reward_terms(state(q=open_jaws), d, still, "paper")
+        np.testing.assert_allclose(terms[0] + terms[1], 1.0)
+        assert terms[3] > 0.6
 
 
 def rule(time=1.0, reached=True, diverged=False, **changes):
@@ -191,39 +195,66 @@ def test_joint_limits_end_the_episode_but_not_those_of_the_jaws(joint, end):
     assert rule(q=q) == "none"
 
 
-def conditions(reached=True, clearance=0.2, touching=True, miss=0.1, at=None):
-    """Six last decisions that all hold, except `at`, which has the given values."""
-    values = [np.full((1, 6), 0.2), np.full((1, 6, 2), True), np.full((1, 6), 0.1)]
-    where = slice(None) if at is None else at
-    values[0][0, where], values[1][0, where, 1], values[2][0, where] = clearance, touching, miss
-    result = crane_env.success_conditions(np.array([reached]), *values)
-    return {name for name, value in result.items() if value[0]}
+def grip(clearance=0.2, touching=(True, True), miss=0.1):
+    values = np.array([clearance]), np.array([touching]), np.array([miss])
+    return crane_env.grip_conditions(*values)[:, 0].tolist()
+
+
+def test_grip_conditions():
+    assert grip() == grip(clearance=0.1) == grip(miss=0.3) == [True, True, True]
+    assert grip(clearance=0.099) == [False, True, True]
+    assert grip(touching=(True, False)) == grip(touching=(False, True)) == [True, False, True]
+    assert grip(miss=0.301) == [True, True, False]
+    assert grip(clearance=np.nan, miss=np.nan) == [False, True, False]
 
 
 def test_success_conditions():
-    assert conditions() == {"success"}
-    assert conditions(reached=False) == {"not_reached"}
-    for at in range(6):  # each decision of the last half second counts
-        assert conditions(clearance=0.099, at=at) == {"not_lifted"}
-        assert conditions(touching=False, at=at) == {"not_held"}
-        assert conditions(miss=0.301, at=at) == {"off_centre"}
-    assert conditions(clearance=0.1, miss=0.3) == {"success"}
-    assert conditions(clearance=0.0, touching=False) == {"not_lifted", "not_held"}
+    def named(reached, *kept):
+        result = crane_env.success_conditions(np.array([reached]), np.array(kept)[:, None])
+        return {name for name, value in result.items() if value[0]}
+
+    assert named(True, True, True, True) == {"success"}
+    assert named(False, True, True, True) == {"not_reached"}
+    assert named(True, False, True, True) == {"not_lifted"}
+    assert named(True, True, False, True) == {"not_held"}
+    assert named(True, True, True, False) == {"off_centre"}
+    assert named(True, False, False, True) == {"not_lifted", "not_held"}
 
 
-def test_success_needs_the_whole_episode():
-    """The window holds the last 0.5 s, and success comes with the time limit only."""
-    for frame_skip, window in [(20, 6), (1, 101), (4, 26)]:
-        envs = CraneVectorEnv(1, frame_skip=frame_skip)
-        assert envs._clearance.shape[1] == window
-        assert envs.max_decisions * frame_skip == 1800
+@pytest.mark.parametrize("frame_skip, window", [(20, 6), (10, 11), (7, 15)])
+def test_success_needs_all_of_the_last_half_second(frame_skip, window, monkeypatch):
+    """One decision without a grip spoils success where it lies in the window, and only there."""
+    names = "not_lifted", "not_held", "off_centre"
+    last = int(np.ceil(1800 / frame_skip)) - 1
+    slips = [0, last - window - 1, last - window, *range(last - window + 1, last + 1)]
+    envs = CraneVectorEnv(len(slips), frame_skip=frame_skip)
+    for which in range(3):
+        envs.reset(seed=0)
+        for k in range(last + 1):
+            kept = np.ones((3, len(slips)), bool)
+            kept[which] = np.array(slips) != k
+            monkeypatch.setattr(crane_env, "grip_conditions", lambda *_, kept=kept: kept)
+            envs._reach_time[:] = 1.0  # stand still but claim to have reached the log
+            *_, truncated, info = envs.advance(np.zeros((len(slips), 6)))
+        assert truncated.all()
+        np.testing.assert_array_equal(info["success"], [True] * 3 + [False] * window)
+        np.testing.assert_array_equal(info[names[which]], ~info["success"])
+
+
+def test_success_needs_the_whole_episode(monkeypatch):
+    """Success comes with the time limit only, and a grip before a start does not count."""
     envs = CraneVectorEnv(1)
     envs.reset(seed=0)
     for k in range(90):
-        envs._reach_time[:] = 1.0  # stand still but claim to have reached the log
+        envs._reach_time[:] = 1.0
         _, _, terminated, truncated, info = envs.advance(np.zeros((1, 6)))
         assert not terminated[0] and truncated[0] == (k == 89) and not info["success"][0]
     assert info["termination"][0] == "time_limit" and info["not_lifted"][0] and info["not_held"][0]
+    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 1), bool))
+    for _ in range(2):
+        envs.reset(seed=0)
+        lifted = [not envs.advance(np.zeros((1, 6)))[-1]["not_lifted"][0] for _ in range(7)]
+        assert lifted == [False] * 5 + [True] * 2
 
 
 def test_reward_is_the_sum_of_the_reported_terms():
