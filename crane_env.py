@@ -205,8 +205,8 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
     (grapple_x, grapple_y, _), (log_x, log_y, _) = state.grapple_axis.T, state.log_axis.T
-    level = np.maximum(np.sqrt(log_x**2 + log_y**2), 1e-9)
-    log_x, log_y = log_x / level, log_y / level
+    shadow = np.maximum(np.sqrt(log_x**2 + log_y**2), 1e-9)  # its length on the ground
+    log_x, log_y = log_x / shadow, log_y / shadow
     dot = grapple_x * log_x + grapple_y * log_y
     cross = grapple_x * log_y - grapple_y * log_x
     signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
@@ -248,7 +248,7 @@ def reward_terms(
     """The four terms r_distance, r_grapple, r_lift, r_balance, (4, N); the reward is their sum.
 
     d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
-    `log_clearance` and `centre_miss`, command (N, 6) the velocities in rad/s and m/s.
+    `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s.
 
     kind "paper" is Sec. III-A2 as printed. "staged" (why: README, errata) pays r_grapple and r_lift
     near the log's centre, r_balance while both jaws hold it off the ground.
@@ -294,9 +294,9 @@ def termination_rule(
 
 
 def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:
-    """Whether the log is lifted, held by both jaws, held near its centre: (3, N) bool.
+    """Whether now the log is lifted, held by both jaws, held near its centre: (3, N) bool.
 
-    clearance and miss (N,) in m, touching (N, 2).
+    clearance and miss (N,) in m, touching (N, 2) bool, as in `info` and `CraneState`.
     """
     return np.array([clearance >= MIN_CLEARANCE, touching.all(axis=-1), miss <= MAX_MISS])
 
@@ -305,9 +305,10 @@ def success_conditions(reached: Array, kept: Array) -> dict[str, Array]:
     """The one definition of success, for training, evaluation and tests: (N,) bool each.
 
     reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. kept (3, N): which of
-    `grip_conditions` held at every decision of the last HOLD_TIME of a whole episode.
+    `grip_conditions` held at every decision of the last HOLD_TIME. Besides, an episode must be
+    whole: only one that ends by the time limit counts.
     """
-    names = ("not_reached", "not_lifted", "not_held", "off_centre")
+    names = ("not_reached", "not_lifted", "not_held", "off_centre")  # the last three as in kept
     failed = dict(zip(names, ~np.array([reached, *kept])))
     return {"success": reached & kept.all(axis=0), **failed}
 
@@ -331,8 +332,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     `info` describes the step just made, for every crane, also one that ended with it:
     `termination` (of TERMINATIONS, or "none"), the terms r_distance, r_grapple, r_lift, r_balance,
     `d_combine`, `clearance`, `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful
-    where an episode ended, `success` and its failed conditions `not_reached`, `not_lifted`,
-    `not_held`, `off_centre`. Where episodes ended, `final_obs` and `final_info` hold their end
+    where an episode ended, `success` and its failed conditions `not_reached` and, in the last
+    HOLD_TIME, `not_lifted`, `not_held`, `off_centre` (all three in an episode that is shorter).
+    Where episodes ended, `final_obs` and `final_info` hold their end
     under the masks `_final_obs` and `_final_info`.
     """
 
@@ -401,7 +403,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         self.dt = self.frame_skip * TIMESTEP
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
-        self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1
+        self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1  # with both its ends
         draws = self.max_decisions + 1 if pose_noise == "step" else 1
         self._decisions = np.zeros(self.num_envs, int)
         self._reach_time = np.full(self.num_envs, np.inf)
@@ -570,7 +572,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
         obs[np.isnan(obs)] = 0  # of a crane that diverged
         space = self.single_observation_space
-        return np.clip(obs, space.low, space.high).astype(np.float32), info
+        return np.clip(obs, space.low, space.high).astype(np.float32, order="C"), info
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""

@@ -6,9 +6,10 @@
     python eval_crane.py --policy random --trials 20
     python eval_crane.py --video lift.mp4             # or --viewer, in a window
 
-A trial succeeds as `crane_env.success_conditions` says: log reached within 6 s, and through the
-last 0.5 s of 9 s lifted, held by both jaws, and gripped within 0.3 m of its centre. Trial k of a
-diameter and seed is always the same trial. Intervals are 95 % Wilson score intervals.
+A trial succeeds as `grip_conditions` and `success_conditions` of crane_env.py say: log reached
+within 6 s, and through the last 0.5 s of 9 s lifted, held by both jaws, and gripped within 0.3 m of
+its centre. Trial k of a diameter and seed is always the same trial. Intervals are 95 % Wilson score
+intervals.
 """
 
 import csv

@@ -80,7 +80,8 @@ def test_axes_of_the_crane_turn_with_it():
     obs = {}
     for axes in ("world", "crane"):
         envs = CraneVectorEnv(8, axes=axes)
-        obs[axes] = envs.reset(seed=0)[0].astype(float)
+        obs[axes] = envs.reset(seed=0)[0]
+        assert obs[axes].flags.c_contiguous  # as what rounds by layout, torch's sums, expects
     grapple = envs._state().grapple_centre
     ahead = grapple[:, :2] / np.linalg.norm(grapple[:, :2], axis=-1, keepdims=True)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)

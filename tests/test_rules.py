@@ -100,42 +100,42 @@ def test_clearance_and_miss():
 COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaws, 1.3 with them
 
 
-def reward_terms(state, d_combine, *args, **kwargs):
-    """The four terms of one crane."""
-    measured = crane_env.log_clearance(state), crane_env.centre_miss(state)
-    return crane_env.reward_terms(state, np.array([d_combine]), *measured, *args, **kwargs)[:, 0]
+def terms_of(crane, d_combine, *args, **kwargs):
+    """The four terms of the reward of one crane."""
+    measured = crane_env.log_clearance(crane), crane_env.centre_miss(crane)
+    return crane_env.reward_terms(crane, np.array([d_combine]), *measured, *args, **kwargs)[:, 0]
 
 
 def test_staged_reward():
     lifted = {"log_centre": [4.0, 6.0, 0.45], "grapple_centre": [4.3, 6.125, 0.8]}
-    terms = reward_terms(state(**lifted), 0.4, COMMAND, omega2=2.0)
+    terms = terms_of(state(**lifted), 0.4, COMMAND, omega2=2.0)
     r, grasp = np.exp(-0.8), 2 * 0.5 * np.exp(-0.3)  # q8 / 3 = 0.5; 0.05 m farther than 0.35 m
     # 0.125 m off the centre, half of 0.25 m and a quarter of 0.5 m; clearance 0.45 - 0.2 = 0.5^2
     centred, calm = np.exp(-0.25), 1 - np.tanh(0.5)
     lift = 0.5 * centred
     np.testing.assert_allclose(terms, [r, grasp * np.exp(-0.0625), 2 * lift, 3 * calm * lift])
-    farther = reward_terms(state(**lifted), 0.9, COMMAND, omega2=2.0)
+    farther = terms_of(state(**lifted), 0.9, COMMAND, omega2=2.0)
     assert np.all(farther[:2] < terms[:2])
     np.testing.assert_array_equal(farther[2:], terms[2:])  # a lift is worth as much anywhere
     for height in (0.2, 0.15):  # on the ground, and pressed into it
         down = state(log_centre=[4.0, 6.0, height], grapple_centre=[4.0, 6.0, 0.4])
-        terms = reward_terms(down, 0.4, COMMAND)
+        terms = terms_of(down, 0.4, COMMAND)
         np.testing.assert_allclose(terms[2:], 0, atol=2e-4)
     lifted["grapple_centre"] = [4.0, 7.0, 0.45]  # 1 m off
-    terms = reward_terms(state(**lifted), 0.4, COMMAND, omega2=2.0)
+    terms = terms_of(state(**lifted), 0.4, COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [r, grasp * np.exp(-4), 0.0, 0.0], atol=1e-6)
     one_jaw = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[True, False])
-    terms = reward_terms(one_jaw, 0.4, COMMAND, omega2=2.0)
+    terms = terms_of(one_jaw, 0.4, COMMAND, omega2=2.0)
     np.testing.assert_allclose(terms, [r, grasp, 2 * 0.5, 0.0])
     for clearance, expected in [(1.0, 2.0), (2.25, 2 / 1.5), (4.0, 1.0)]:  # 1 m is best
         high = state(log_centre=[4, 6, 0.2 + clearance], grapple_centre=[4.0, 6.0, 3.2])
-        terms = reward_terms(high, 0.34, COMMAND)
+        terms = terms_of(high, 0.34, COMMAND)
         np.testing.assert_allclose(terms[2], expected)
     np.testing.assert_allclose(terms[1], 1.0)  # nearer than 0.35 m is no better for r_grapple
 
 
 def test_paper_reward():
-    terms = reward_terms(state(log_centre=[4.0, 6.0, 0.7]), 0.25, COMMAND, "paper", 2.0)
+    terms = terms_of(state(log_centre=[4.0, 6.0, 0.7]), 0.25, COMMAND, "paper", 2.0)
     r = np.exp(-0.5)
     grapple = 0.5 * r + 0.5 * (1 - r)
     lift = (1 - np.tanh(0.3)) * (1 - grapple)
@@ -147,7 +147,7 @@ def test_printed_reward_pays_for_standing_still():
     """Why "staged" is the default: open jaws at rest earn the same at any distance."""
     still, open_jaws = np.zeros((1, 6)), np.array([0, 0.5, 0.2, 0.5, 0.87, np.pi / 2, 0, 0.0])
     for d in (0.1, 5.0):
-        terms = reward_terms(state(q=open_jaws), d, still, "paper")
+        terms = terms_of(state(q=open_jaws), d, still, "paper")
         np.testing.assert_allclose(terms[0] + terms[1], 1.0)
         assert terms[3] > 0.6
 
@@ -221,24 +221,34 @@ def test_success_conditions():
     assert named(True, False, False, True) == {"not_lifted", "not_held"}
 
 
-@pytest.mark.parametrize("frame_skip, window", [(20, 6), (10, 11), (7, 15)])
-def test_success_needs_all_of_the_last_half_second(frame_skip, window, monkeypatch):
+@pytest.mark.parametrize(
+    "frame_skip, window, decisions",
+    [(1, 101, 1800), (4, 26, 450), (7, 15, 258), (10, 11, 180), (20, 6, 90)],
+)
+def test_length_of_an_episode_and_of_its_end(frame_skip, window, decisions):
+    envs = CraneVectorEnv(1, frame_skip=frame_skip)
+    assert envs.hold_decisions == window and envs.max_decisions == decisions
+
+
+@pytest.mark.parametrize("frame_skip", [20, 10, 7])
+def test_success_needs_all_of_the_last_half_second(frame_skip, monkeypatch):
     """One decision without a grip spoils success where it lies in the window, and only there."""
-    names = "not_lifted", "not_held", "off_centre"
-    last = int(np.ceil(1800 / frame_skip)) - 1
-    slips = [0, last - window - 1, last - window, *range(last - window + 1, last + 1)]
+    envs = CraneVectorEnv(1, frame_skip=frame_skip)
+    window, last = envs.hold_decisions, envs.max_decisions - 1
+    slips = np.array([0, last - window - 1, *range(last - window, last + 1)])
     envs = CraneVectorEnv(len(slips), frame_skip=frame_skip)
-    for which in range(3):
+    kept = np.ones((3, len(slips)), bool)
+    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: kept)
+    for which, name in enumerate(["not_lifted", "not_held", "off_centre"]):
         envs.reset(seed=0)
         for k in range(last + 1):
-            kept = np.ones((3, len(slips)), bool)
-            kept[which] = np.array(slips) != k
-            monkeypatch.setattr(crane_env, "grip_conditions", lambda *_, kept=kept: kept)
+            kept[:], kept[which] = True, slips != k
             envs._reach_time[:] = 1.0  # stand still but claim to have reached the log
             *_, truncated, info = envs.advance(np.zeros((len(slips), 6)))
-        assert truncated.all()
-        np.testing.assert_array_equal(info["success"], [True] * 3 + [False] * window)
-        np.testing.assert_array_equal(info[names[which]], ~info["success"])
+            assert (truncated == (k == last)).all()
+        np.testing.assert_array_equal(info["success"], slips <= last - window)
+        for other in ("not_lifted", "not_held", "off_centre"):
+            assert (info[other] == (~info["success"] & (other == name))).all()
 
 
 def test_success_needs_the_whole_episode(monkeypatch):
@@ -250,20 +260,30 @@ def test_success_needs_the_whole_episode(monkeypatch):
         _, _, terminated, truncated, info = envs.advance(np.zeros((1, 6)))
         assert not terminated[0] and truncated[0] == (k == 89) and not info["success"][0]
     assert info["termination"][0] == "time_limit" and info["not_lifted"][0] and info["not_held"][0]
-    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 1), bool))
-    for _ in range(2):
-        envs.reset(seed=0)
-        lifted = [not envs.advance(np.zeros((1, 6)))[-1]["not_lifted"][0] for _ in range(7)]
-        assert lifted == [False] * 5 + [True] * 2
+
+    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 2), bool))
+    envs, lifted = CraneVectorEnv(2), []
+    envs.reset(seed=0)
+    for k in range(14):
+        if k == 7:
+            envs._start_episodes(np.array([1]))
+        lifted.append(~envs.advance(np.zeros((2, 6)))[-1]["not_lifted"])
+    first, second = np.array(lifted).T.tolist()
+    assert first == [False] * 5 + [True] * 9
+    assert second == ([False] * 5 + [True] * 2) * 2
 
 
-def test_reward_is_the_sum_of_the_reported_terms():
-    for reward in ("staged", "paper"):
-        envs = CraneVectorEnv(4, reward=reward)
-        envs.reset(seed=0)
-        _, total, _, _, info = envs.advance(np.full((4, 6), 0.5))
-        terms = [info[f"r_{name}"] for name in ("distance", "grapple", "lift", "balance")]
-        np.testing.assert_allclose(total, np.sum(terms, axis=0))
+@pytest.mark.parametrize("reward", ["staged", "paper"])
+def test_reward_is_the_sum_of_the_reported_terms(reward):
+    envs = CraneVectorEnv(4, reward=reward)
+    envs.reset(seed=0)
+    _, total, _, _, info = envs.advance(np.full((4, 6), 0.5))
+    terms = [info[f"r_{name}"] for name in ("distance", "grapple", "lift", "balance")]
+    np.testing.assert_allclose(total, np.sum(terms, axis=0))
+    now = envs._state()
+    measured = info["d_combine"], crane_env.log_clearance(now), crane_env.centre_miss(now)
+    command = np.tile(0.5 * REAL[1], (4, 1))
+    np.testing.assert_allclose(terms, crane_env.reward_terms(now, *measured, command, reward))
 
 
 def test_time_to_reach_is_the_first_time():
