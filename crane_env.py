@@ -53,8 +53,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-    # To render without a display; before mujoco is imported, which fails where EGL is missing.
+if HEADLESS := sys.platform == "linux" and not (
+    os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+):
+    # To render all the same; before mujoco is imported, which fails where EGL is missing.
     if ctypes.util.find_library("EGL"):
         os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -84,7 +86,7 @@ ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle
 Q8_MAX = 3.0  # rad
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
 CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
-MIN_CLEARANCE = 0.1  # m below the log's lowest point
+MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
 MAX_MISS = 0.3  # m along the log
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
@@ -368,6 +370,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         _choice("pose_noise", pose_noise, ("none", "step", "episode"))
         _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         _choice("camera", camera, ("overview", "side", "grapple"))
+        if render_mode == "human" and HEADLESS:  # the window's library would end the process
+            raise RuntimeError("render_mode 'human' needs a display, and DISPLAY is not set")
         for name, share in (("difficulty", difficulty), ("retry", retry)):
             if not 0 <= share <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {share}")

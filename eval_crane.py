@@ -255,8 +255,10 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
     try:
-        with imageio.get_writer(unfinished, **options) as video:
-            for diameter, seed in zip(tqdm(diameters, desc="trials filmed"), seeds):
+        frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where one ends early
+        bar = tqdm(total=frames, unit="frame", leave=False)
+        with bar, imageio.get_writer(unfinished, **options) as video:
+            for diameter, seed in zip(diameters, seeds):
                 envs = CraneVectorEnv(1, diameter=diameter, **kwargs)
                 obs, _ = envs.reset(seed=[seed])
                 act, ended, step = make_act(), False, 0
@@ -266,6 +268,7 @@ def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
                     obs, _, terminated, truncated, _ = envs.advance(actions)
                     if step % frame_every == 0:
                         video.append_data(envs.render()[0])
+                        bar.update()
                     ended, step = terminated[0] or truncated[0], step + 1
                 envs.close()
         os.replace(unfinished, args.video)
@@ -295,7 +298,6 @@ def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    headless = not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     low, high = crane_env.D_MIN, crane_env.D_MAX
     for wrong, message in [
         (args.trials < 1, f"--trials must be at least 1, got {args.trials}"),
@@ -326,7 +328,7 @@ def main() -> None:
             f"--width must be even and lie in [64, 1920], got {args.width}",
         ),
         (
-            args.viewer and sys.platform == "linux" and headless,
+            args.viewer and crane_env.HEADLESS,
             "--viewer needs a display, and DISPLAY is not set; use --video lift.mp4",
         ),
     ]:

@@ -436,7 +436,9 @@ def main() -> None:
             apart = max(disagreement(crane, make_act, kwargs, skip))
             print(f"{crane.__name__} beside CraneVectorEnv, skip {skip}: apart by {apart:.0e}")
             if apart > 1e-3:
-                raise SystemExit(f"{crane.__name__} is another task than CraneVectorEnv")
+                raise SystemExit(
+                    f"{crane.__name__} is another task: plain_crane.py needs your change"
+                )
 
     results: Results = {}
     cells = cheap_cells(args.only, sizes, make_act, kwargs)

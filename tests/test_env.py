@@ -429,6 +429,12 @@ def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
     assert not terminated.any() and set(info["termination"]) == {"none"}
 
 
+def test_a_window_needs_a_display(monkeypatch):
+    monkeypatch.setattr(crane_env, "HEADLESS", True)
+    with pytest.raises(RuntimeError, match="needs a display"):
+        CraneVectorEnv(1, render_mode="human")
+
+
 def test_render():
     try:
         mujoco.Renderer(crane_env.load_model(), 8, 8).close()
