@@ -304,7 +304,7 @@ def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:
 
 
 def success_conditions(reached: Array, kept: Array) -> dict[str, Array]:
-    """The one definition of success, for training, evaluation and tests: (N,) bool each.
+    """Success, for training, evaluation and tests alike, and what of it failed: (N,) bool each.
 
     reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. kept (3, N): which of
     `grip_conditions` held at every decision of the last HOLD_TIME. Besides, an episode must be
@@ -336,8 +336,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     `d_combine`, `clearance`, `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful
     where an episode ended, `success` and its failed conditions `not_reached` and, in the last
     HOLD_TIME, `not_lifted`, `not_held`, `off_centre` (all three in an episode that is shorter).
-    Where episodes ended, `final_obs` and `final_info` hold their end
-    under the masks `_final_obs` and `_final_info`.
+    Where episodes ended, `final_obs` and `final_info` hold their end under the masks `_final_obs`
+    and `_final_info`.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}

@@ -427,6 +427,10 @@ def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
     assert np.isfinite(obs).all() and np.isfinite(info["final_obs"][1]).all()
     _, _, terminated, _, info = envs.step(np.zeros((3, 6)))
     assert not terminated.any() and set(info["termination"]) == {"none"}
+    state = envs._state()
+    state.q[0], state.dq[1], state.log_centre[2] = np.nan, np.inf, np.nan  # should any get this far
+    obs, _ = envs._observe(state, np.zeros((3, 6)))
+    assert envs.observation_space.contains(obs)
 
 
 def test_a_window_needs_a_display(monkeypatch):
