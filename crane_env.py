@@ -1,13 +1,14 @@
 """A forestry crane that grasps and lifts a log: MuJoCo simulator and Gymnasium environment.
 
     import gymnasium, crane_env
-    env = gymnasium.make("ForestryCrane-v0")                   # one crane, `CraneEnv`
+    env = gymnasium.make("ForestryCrane-v0")                    # one crane, `CraneEnv`
     envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=64)  # many at once, `CraneVectorEnv`
 
 The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
 stages), and its grapple hangs from two passive joints q5, q6 below a rotator q7 and two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
-Crane: Simulator and Benchmarking". Sources of all numbers: assets/README.md.
+Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there.
+Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
 
 Observation, float32, `Box` of shape (18,):
 
@@ -27,10 +28,12 @@ Observation, float32, `Box` of shape (18,):
 | 11    | q4 velocity of each stage                        | m/s   | -10     | 10     |
 | 12    | q7 velocity                                      | rad/s | -10     | 10     |
 | 13    | q8 velocity                                      | rad/s | -10     | 10     |
-| 14    | Delta_p,x from grapple centre to log, see axes   | m     | -20     | 20     |
+| 14    | Delta_p,x, grapple centre to log, see axes       | m     | -20     | 20     |
 | 15    | Delta_p,y                                        | m     | -20     | 20     |
 | 16    | Delta_p,z, see offset                            | m     | -20     | 20     |
-| 17    | Delta_psi, 0 aligned (signed_yaw: angle in rad)  | 1     | -4.7124 | 4.7124 |
+| 17    | signed angle to the log, 0 aligned, see below    | rad   | -4.7124 | 4.7124 |
+
+With signed_yaw=False index 17 is the paper's Delta_psi, without unit.
 
 Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
 direction. 0 stops the joint; values outside the box are clipped.
@@ -46,48 +49,61 @@ direction. 0 stops the joint; values outside the box are clipped.
 """
 
 import ctypes.util
+import importlib
 import os
 import sys
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack, get_args, get_type_hints
 
-if HEADLESS := sys.platform == "linux" and not (
-    os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-):
-    # To render all the same; before mujoco is imported, which fails where EGL is missing.
-    if ctypes.util.find_library("EGL"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
+if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco chooses its OpenGL when it is imported
 
 import gymnasium
 import mujoco
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from mujoco.batch import Batch, SimulationError
 from numpy.random import Generator, SeedSequence, default_rng
 
+# ---- constants
+
+HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
-REVISION = 6  # of the task; raise it when a change spoils policies or checkpoints
+REVISION = 6  # of the task; raise it when a change makes trained policies worse
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
+SDF_INITPOINTS, SDF_ITERATIONS = 8, 5  # of each search for SDF contacts (assets/README.md)
 LOG_LENGTH = 2.75  # m
 LOG_DENSITY = 650.0  # kg/m^3
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
+DIAMETERS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # m, of the paper's tables
 POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
 POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
-TIME_LIMIT = 9.0  # s, of an episode
-HOLD_TIME = 0.5  # s at its end, in which the log must be held
-REACH_TIME = 6.0  # s: by then
-REACH_DISTANCE = 0.35  # m: d_combine must have been below this
-LOG_RANGE = 8.0  # m, between grapple centre and log centre
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
-DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward
-CENTRED = 0.25  # m along the log, off centre by which the staged r_lift falls to 1/e
+
+TIME_LIMIT = 9.0  # s, of an episode
+REACH_TIME = 6.0  # s, by which the log must have been reached
+REACH_DISTANCE = 0.35  # m, d_combine below which the log is reached
+LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre
+LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.012 rad or 0.016 m
+HOLD_TIME = 0.5  # s at the end of an episode in which the log must be held
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
-MAX_MISS = 0.3  # m along the log
+MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
+
+OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
+DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give it
+GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed the jaws
+LIFT_WEIGHT = 2.0  # largest staged r_lift
+BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
+NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
+GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
+LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
@@ -95,60 +111,92 @@ SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telesco
     ),
     "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
 }
-JOINTS = ["q1", "q2", "q3", "q4", "q5", "q6", "q7", "q8"]
-SERVOS = ["q1", "q2", "q3", "q4", "q4_stage2", "q7", "q8", "q8_inner"]
+# The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
+JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
+SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
-ACTUATED = [0, 1, 2, 3, 6, 7]  # rows of JOINTS
-LIMITED = slice(0, 7)  # reaching a jaw's end stop is part of grasping
+ACTUATED = [0, 1, 2, 3, 6, 7]  # of our q1 ... q8
+LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
+
+TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance"]
 TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reached", "time_limit"]
+CONDITIONS = ["not_reached", "not_lifted", "not_held", "off_centre"]
+RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss", *CONDITIONS}
 Array = np.ndarray
 
 
-class CraneState(NamedTuple):
-    """What observation, reward and rules are computed from, for N cranes."""
-
-    q: Array  # (N, 8) joint positions, rad and m
-    dq: Array  # (N, 6) velocities of the actuated joints
-    grapple_centre: Array  # (N, 3) p_C, m
-    grapple_axis: Array  # (N, 3) e_C,x, unit
-    log_centre: Array  # (N, 3) p_l, m
-    log_axis: Array  # (N, 3) along the log, unit
-    touching: Array  # (N, 2) bool, outer and inner jaw on the log
-    diameter: Array  # (N,) m
+# ---- options
 
 
-def _choice(name: str, value: Any, allowed: Sequence) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+class Options(TypedDict, total=False):
+    """What can be changed about the task: keywords of `gymnasium.make`, `--env.*` of the scripts.
+
+    In parentheses: the default of ForestryCrane-v0.
+    """
+
+    frame_skip: int  # physics steps of 5 ms per decision (20)
+    contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
+    reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
+    speed: Literal["real", "mjcf"]  # joint speed limits (real)
+    offset: Literal["plus", "minus"]  # sign of the diameter's part in Delta_p,z (plus)
+    signed_yaw: bool  # observe the signed angle to the log, not the paper's Delta_psi (True)
+    axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
+    pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
+    difficulty: float  # 0: easy starts, 1: the full task (1.0)
+    curriculum: bool  # raise the difficulty from 0 to 1 with the success rate (False)
+    retry: float  # share of episodes that start as a recent failure of that crane did (0.0)
+    integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
+    solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
 
 
-def _count(name: str, value: Any) -> int:
-    if int(value) != value or value < 1:
-        raise ValueError(f"{name} must be a whole number of at least 1, got {value}")
-    return int(value)
+DEFAULTS = Options(
+    frame_skip=20, contact="primitive", reward="staged", speed="real", offset="plus",
+    signed_yaw=True, axes="crane", pose_noise="none", difficulty=1.0, curriculum=False, retry=0.0,
+    integrator="implicitfast", solver="Newton",
+)  # fmt: skip
+PAPER = Options(  # ForestryCranePaper-v0
+    frame_skip=1, contact="sdf", reward="paper", offset="minus", signed_yaw=False, axes="world",
+    integrator="implicit", solver="CG",
+)  # fmt: skip
+RANGES = {"frame_skip": (1, 1800), "difficulty": (0, 1), "retry": (0, 1)}
+
+
+def complete(options: Options) -> Options:
+    """The options with all defaults filled in. ValueError names a wrong one and what is allowed."""
+    types = get_type_hints(Options)
+    for name, value in options.items():
+        if name not in types:
+            raise ValueError(f"the crane has no option {name!r}, only {', '.join(types)}")
+        if name in RANGES:
+            low, high = RANGES[name]
+            good, needed = low <= value <= high, f"lie in [{low}, {high}]"
+        else:
+            allowed = get_args(types[name]) or (False, True)
+            good, needed = value in allowed, f"be one of {', '.join(map(repr, allowed))}"
+        if not good or (types[name] is int and value != int(value)):
+            raise ValueError(f"{name} must {needed}, got {value!r}")
+    return {**DEFAULTS, **options}
+
+
+# ---- model
 
 
 def load_model(
     contact: str = "primitive",
     integrator: str = "implicitfast",
     solver: str = "Newton",
-    sdf_initpoints: int = 8,  # starts of each search for contacts by "sdf"
-    sdf_iterations: int = 5,  # gradient steps from each start
-    visual: bool = True,  # without, nothing is left that is only drawn: the same motion, sooner
+    visual: bool = True,
 ) -> mujoco.MjModel:
     """Compile assets/crane.xml.
 
     contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
     jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B).
+    visual False leaves out what is only drawn: the same motion, sooner.
     """
-    _choice("contact", contact, ("primitive", "sdf"))
-    _choice("integrator", integrator, ("implicitfast", "implicit", "discrete", "Euler"))
-    _choice("solver", solver, ("Newton", "CG"))
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
-    spec.option.sdf_initpoints = _count("sdf_initpoints", sdf_initpoints)
-    spec.option.sdf_iterations = _count("sdf_iterations", sdf_iterations)
+    spec.option.sdf_initpoints, spec.option.sdf_iterations = SDF_INITPOINTS, SDF_ITERATIONS
     if contact == "sdf":
         # Collision bits of crane.xml: 4 is the log's. 8 collides with nothing, but a geom without
         # any bit counts as only drawn.
@@ -196,13 +244,29 @@ def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array,
     return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
 
+# ---- observation, reward and rules of N cranes, without the simulator
+
+
+class CraneState(NamedTuple):
+    """What observation, reward and rules are computed from, for N cranes."""
+
+    q: Array  # (N, 8) joint positions, rad and m
+    dq: Array  # (N, 6) velocities of the actuated joints
+    grapple_centre: Array  # (N, 3) p_C, m
+    grapple_axis: Array  # (N, 3) e_C,x, unit
+    log_centre: Array  # (N, 3) p_l, m
+    log_axis: Array  # (N, 3) along the log, unit
+    touching: Array  # (N, 2) bool, outer and inner jaw on the log
+    diameter: Array  # (N,) m
+
+
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
     """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
 
     Paper: Eqs. (relative distance) and (angle distance). offset "plus" adds d_off = (d_max - d) / 2
-    of the log's diameter d, "minus" subtracts it (README, errata). The signed angle turns the
-    grapple's axis into the log's, a line without direction: the shorter turn, or the other one
-    where the shorter would take the rotator beyond ROTATOR_MAX. A hanging grapple's yaw is q1 - q7.
+    of the log's diameter d, "minus" subtracts it. The signed angle turns the grapple's axis into
+    the log's. A log looks the same after half a turn, so this is the shorter turn, or the longer
+    one where the shorter would take the rotator beyond ROTATOR_MAX.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
@@ -214,7 +278,8 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
     signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
     slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
     slew = (slew + np.pi) % (2 * np.pi) - np.pi
-    rotator = state.q[:, 6] + slew - signed_angle  # once the crane faces the log
+    # q7 once the crane faces the log and the grapple is aligned; a hanging grapple's yaw is q1 - q7
+    rotator = state.q[:, 6] + slew - signed_angle
     signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > ROTATOR_MAX)
     return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
 
@@ -245,17 +310,16 @@ def reward_terms(
     miss: Array,
     command: Array,
     kind: str = "staged",
-    omega2: float = 1.0,
 ) -> Array:
     """The four terms r_distance, r_grapple, r_lift, r_balance, (4, N); the reward is their sum.
 
     d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
     `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s.
 
-    kind "paper" is Sec. III-A2 as printed. "staged" (why: README, errata) pays r_grapple and r_lift
-    near the log's centre, r_balance while both jaws hold it off the ground.
+    kind "paper" is Sec. III-A2 as printed. "staged" pays each term only once the one before it is
+    earned (docs/environment.md, errata).
     """
-    r_distance = np.exp(-omega2 * d_combine)
+    r_distance = np.exp(-OMEGA2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
     if kind == "paper":
         r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
@@ -263,14 +327,14 @@ def reward_terms(
         r_lift = (1 - np.tanh(height_error)) * (1 - r_grapple)
         r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
     else:
-        near = np.minimum(1, np.exp(-3 * omega2 * (d_combine - REACH_DISTANCE)))
-        off_centre = (miss / CENTRED) ** 2
-        r_grapple = 2 * near * np.exp(-off_centre / 4) * closed
-        clearance = np.maximum(clearance, 1e-9)  # 0 on the ground; best is 1 m
-        lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
+        near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (d_combine - REACH_DISTANCE)))
+        r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
+        clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
+        height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
+        lift = np.exp(-((miss / LIFT_MISS) ** 2)) * height
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
         held = state.touching.all(axis=-1)
-        r_lift, r_balance = 2 * lift, 3 * calm * held * lift
+        r_lift, r_balance = LIFT_WEIGHT * lift, BALANCE_WEIGHT * calm * held * lift
     return np.array([r_distance, r_grapple, r_lift, r_balance])
 
 
@@ -283,9 +347,10 @@ def termination_rule(
     as in SPEEDS, in rad, m and s.
     """
     q, (low, high) = state.q[:, LIMITED], limits[LIMITED].T
+    beyond = (q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE)
     rules = [  # in the order of TERMINATIONS
         diverged,
-        ((q < low) | (q > high)).any(axis=-1),
+        beyond.any(axis=-1),
         ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
         np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1) > LOG_RANGE,
         ~reached & (time > REACH_TIME - 1e-9),
@@ -296,34 +361,14 @@ def termination_rule(
 
 
 def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:
-    """Whether now the log is lifted, held by both jaws, held near its centre: (3, N) bool.
+    """Whether the log is now lifted, held by both jaws, and held near its centre: (3, N) bool.
 
     clearance and miss (N,) in m, touching (N, 2) bool, as in `info` and `CraneState`.
     """
     return np.array([clearance >= MIN_CLEARANCE, touching.all(axis=-1), miss <= MAX_MISS])
 
 
-def success_conditions(reached: Array, kept: Array) -> dict[str, Array]:
-    """Success, for training, evaluation and tests alike, and what of it failed: (N,) bool each.
-
-    reached (N,): d_combine was below REACH_DISTANCE within REACH_TIME. kept (3, N): which of
-    `grip_conditions` held at every decision of the last HOLD_TIME. Besides, an episode must be
-    whole: only one that ends by the time limit counts.
-    """
-    names = ("not_reached", "not_lifted", "not_held", "off_centre")  # the last three as in kept
-    failed = dict(zip(names, ~np.array([reached, *kept])))
-    return {"success": reached & kept.all(axis=0), **failed}
-
-
-def monte_carlo_trials(
-    seed: int, trials: int, diameters: Sequence[float] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-) -> tuple[Array, list[SeedSequence]]:
-    """Diameters (m) and seeds of trials per diameter, for `CraneVectorEnv` and its `reset`.
-
-    Trial k at a diameter is the same whatever the number of trials and the other diameters.
-    """
-    keys = [(round(1000 * d), k) for d in diameters for k in range(trials)]
-    return np.repeat(diameters, trials), [SeedSequence(seed, spawn_key=key) for key in keys]
+# ---- environments
 
 
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
@@ -331,13 +376,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     Crane i's starts depend on the seed, on i and, with retry, on its failures; not on N or threads.
 
-    `info` describes the step just made, for every crane, also one that ended with it:
-    `termination` (of TERMINATIONS, or "none"), the terms r_distance, r_grapple, r_lift, r_balance,
-    `d_combine`, `clearance`, `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful
-    where an episode ended, `success` and its failed conditions `not_reached` and, in the last
-    HOLD_TIME, `not_lifted`, `not_held`, `off_centre` (all three in an episode that is shorter).
-    Where episodes ended, `final_obs` and `final_info` hold their end under the masks `_final_obs`
-    and `_final_info`.
+    `info` describes the step just made, for every crane, also one whose episode just ended:
+    `termination` (one of TERMINATIONS, or "none"), the reward's TERMS, `d_combine`, `clearance`,
+    `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful where an episode ended,
+    `success` and which of CONDITIONS failed it. `final_obs` and `final_info` hold the end of an
+    episode, under the masks `_final_obs` and `_final_info`.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -345,76 +388,61 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def __init__(
         self,
         num_envs: int = 1,  # N
-        frame_skip: int = 20,  # physics steps of 5 ms per decision: 10 Hz; 1 is the paper's
-        reward: str = "staged",  # or "paper", see `reward_terms`
-        speed: str = "real",  # command limits, a key of SPEEDS
-        offset: str = "plus",  # or "minus", see `relative_pose`
-        signed_yaw: bool = False,  # observe the signed angle, see `relative_pose`
-        axes: str = "world",  # of the observed Delta_p; "crane": x along the boom, y to its left
-        pose_noise: str = "none",  # of the observation; "step" at every decision, "episode" once
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
-        difficulty: float = 1.0,  # see `sample_start`; may be assigned, for new starts from then on
-        retry: float = 0.0,  # share of starts that repeat one of the crane's last 4 failures
-        omega2: float = 1.0,  # of the reward, 1/m
         env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: str | None = None,  # or "human", "rgb_array"
         camera: str = "overview",  # or "side", "grapple"
         width: int = 640,
         height: int = 480,
-        **model_options: Any,  # of `load_model`; visual only with a render_mode where not given
+        **options: Unpack[Options],
     ):
-        _choice("reward", reward, ("staged", "paper"))
-        _choice("speed", speed, tuple(SPEEDS))
-        _choice("offset", offset, ("minus", "plus"))
-        _choice("axes", axes, ("world", "crane"))
-        _choice("pose_noise", pose_noise, ("none", "step", "episode"))
-        _choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        _choice("camera", camera, ("overview", "side", "grapple"))
+        if num_envs != int(num_envs) or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs}")
+        if render_mode not in (None, "human", "rgb_array"):
+            raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode}")
+        if camera not in ("overview", "side", "grapple"):
+            raise ValueError(f"camera must be 'overview', 'side' or 'grapple', got {camera!r}")
         if render_mode == "human" and HEADLESS:  # the window's library would end the process
             raise RuntimeError("render_mode 'human' needs a display, and DISPLAY is not set")
-        for name, share in (("difficulty", difficulty), ("retry", retry)):
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name} must lie in [0, 1], got {share}")
-        self.num_envs = _count("num_envs", num_envs)
-        self.frame_skip = _count("frame_skip", frame_skip)
         if diameter is not None:
             d = np.asarray(diameter, float)
-            if d.shape not in [(), (self.num_envs,)] or not np.all((D_MIN <= d) & (d <= D_MAX)):
-                needed = f"one number or {self.num_envs} numbers in [{D_MIN}, {D_MAX}] m"
+            if d.shape not in [(), (num_envs,)] or not np.all((D_MIN <= d) & (d <= D_MAX)):
+                needed = f"one number or {num_envs} numbers in [{D_MIN}, {D_MAX}] m"
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
-            diameter = np.broadcast_to(d, self.num_envs)
-        self.reward, self.omega2, self.offset, self.signed_yaw = reward, omega2, offset, signed_yaw
-        self.speed, self.axes, self.pose_noise = SPEEDS[speed], axes, pose_noise
-        self.difficulty, self.retry, self.fixed_diameter = difficulty, retry, diameter
-        self.render_mode, self.camera, self._frame_size = render_mode, camera, (height, width)
+            diameter = np.broadcast_to(d, num_envs)
+        self.options = options = complete(options)
+        self.num_envs, self.fixed_diameter = int(num_envs), diameter
+        self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
         self.viewer = None  # the window, or the renderer of "rgb_array"
-
-        self.model = model = load_model(**{"visual": render_mode is not None, **model_options})
-        self.batch = batch = Batch(model, self.num_envs, env_threads, persistent=True)
-        for field in ("geom_size", "body_mass", "body_inertia"):
-            batch.expand(field)  # each crane has a log of its own
-        # live views of the engine's arrays, and where in them our joints are
-        views = map(batch.bind, ("qpos", "qvel", "act", "ctrl", "qfrc_bias", "sensordata"))
-        self._qpos, self._qvel, self._act, self._ctrl, self._bias, self._sensors = views
-        self._log_size = batch.geom("log").size
-        joints = [model.joint(name).id for name in JOINTS]
-        servos = [model.joint(name).id for name in SERVOS]
-        self.joint_range = model.jnt_range[joints]  # (8, 2), rad and m
-        self._q, self._dq = model.jnt_qposadr[joints], model.jnt_dofadr[joints][ACTUATED]
-        self._servo_q, self._servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
-        self._servo_kp = model.actuator_gainprm[8:, 0]  # of the integrators, behind 8 velocities
-        self._max_lead = model.jnt_actfrcrange[servos, 1] / self._servo_kp
-
-        self.dt = self.frame_skip * TIMESTEP
+        self.speed, self.frame_skip = SPEEDS[options["speed"]], int(options["frame_skip"])
+        self.difficulty = 0.0 if options["curriculum"] else options["difficulty"]
+        self.dt = self.frame_skip * TIMESTEP  # s, one decision
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
         self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1  # with both its ends
-        draws = self.max_decisions + 1 if pose_noise == "step" else 1
-        self._decisions = np.zeros(self.num_envs, int)
-        self._reach_time = np.full(self.num_envs, np.inf)
-        self._streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
-        self._noise = np.zeros((self.num_envs, draws, 2))  # epsilon; "none" never reads it
-        self._rngs: list[tuple[Generator, Generator]] | None = None
-        self._starts: list[tuple] = [()] * self.num_envs
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
+
+        engine = options["contact"], options["integrator"], options["solver"]
+        self.model = load_model(*engine, visual=render_mode is not None)
+        self.batch = batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
+        for field in ("geom_size", "body_mass", "body_inertia"):
+            batch.expand(field)  # each crane has a log of its own
+        # live views of the engine's arrays, one row a crane
+        self.qpos, self.qvel, self.act = batch.bind("qpos"), batch.bind("qvel"), batch.bind("act")
+        self.ctrl, self.qfrc_bias = batch.bind("ctrl"), batch.bind("qfrc_bias")
+        self.sensordata, self.log_size = batch.bind("sensordata"), batch.geom("log").size
+        self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
+        _, integrators = np.split(self.model.actuator_gainprm, 2)  # after the velocity actuators
+        self.servo_kp = integrators[:, 0]
+        self.max_lead = self.model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp
+
+        self.decisions = np.zeros(self.num_envs, int)  # since the start of each episode
+        self.reach_time = np.full(self.num_envs, np.inf)  # s
+        self.streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
+        self.starts: list[tuple] = [()] * self.num_envs
+        self.recent_success = deque(maxlen=200)  # of ended episodes
+        self.rngs: list[tuple[Generator, Generator]] | None = None
+        draws = self.max_decisions + 1 if options["pose_noise"] == "step" else 1
+        self.noise = np.zeros((self.num_envs, draws, 2))  # epsilon_p, epsilon_o
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
         bound = np.repeat([10.0, 20.0, 1.5 * np.pi], [6, 3, 1])  # dq, Delta_p, its angle
@@ -423,21 +451,20 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
         super().reset(seed=seed if isinstance(seed, int) else None)
-        if seed is not None or self._rngs is None:
+        if seed is not None or self.rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
                 seed = SeedSequence(seed).spawn(self.num_envs)
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
             # starts and pose noise have streams of their own: noise leaves the starts as they are
-            self._rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
-            self._failures = [deque(maxlen=4) for _ in seeds]
-        return self._start_episodes(np.arange(self.num_envs))
+            self.rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
+            self.failures = [deque(maxlen=4) for _ in seeds]
+        return self.start_episodes(np.arange(self.num_envs))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
@@ -450,13 +477,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             for i in ended:
                 info["final_obs"][i] = obs[i].copy()
             info["_final_obs"] = info["_final_info"] = done
-            starts, _ = self._start_episodes(ended)
+            starts, _ = self.start_episodes(ended)
             obs[ended] = starts[ended]
         return obs, reward, terminated, truncated, info
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """`step` without autoreset: an ended episode stays where it ended."""
-        if self._rngs is None:
+        if self.rngs is None:
             raise RuntimeError("call reset() before step()")
         actions = np.asarray(actions, dtype=np.float64)
         if actions.shape != (self.num_envs, 6):
@@ -465,65 +492,82 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("actions must be finite, got NaN or infinity")
         actions = np.clip(actions, -1, 1)
         command = np.where(actions < 0, -actions * self.speed[0], actions * self.speed[1])
-        diverged = self._simulate(command[:, COMMAND_OF_SERVO])
-        self._decisions += 1
+        diverged = self.simulate(command[:, COMMAND_OF_SERVO])
+        self.decisions += 1
 
-        state, time = self._state(), self._decisions * self.dt
-        obs, info = self._observe(state, command)
+        state, time = self.state(), self.decisions * self.dt
+        obs, info = self.observe(state, command)
         near = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
-        self._reach_time = np.minimum(self._reach_time, np.where(near, time, np.inf))
-        reached = np.isfinite(self._reach_time)
+        self.reach_time = np.minimum(self.reach_time, np.where(near, time, np.inf))
+        reached = np.isfinite(self.reach_time)
         gripped = grip_conditions(info["clearance"], state.touching, info["centre_miss"])
-        self._streaks = (self._streaks + 1) * gripped
+        self.streaks = (self.streaks + 1) * gripped
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         truncated = ending == "time_limit"
         terminated = (ending != "none") & ~truncated
-        conditions = success_conditions(reached, self._streaks >= self.hold_decisions)
-        conditions["success"] &= truncated
-        info |= conditions | {"termination": ending, "time_to_reach": self._reach_time.copy()}
-        reward = info["r_distance"] + info["r_grapple"] + info["r_lift"] + info["r_balance"]
-        for i in np.flatnonzero((ending != "none") & ~info["success"]):
-            self._failures[i].append(self._starts[i])
+        # Success, for training, evaluation and tests alike: the log was reached in time, each of
+        # the grip's conditions held at every decision of the last HOLD_TIME, nothing ended early.
+        failed = ~np.array([reached, *(self.streaks >= self.hold_decisions)])
+        info |= dict(zip(CONDITIONS, failed)) | {"success": truncated & ~failed.any(axis=0)}
+        info |= {"termination": ending, "time_to_reach": self.reach_time.copy()}
+        reward = sum(info[term] for term in TERMS)
+        for i in np.flatnonzero(ending != "none"):
+            self.record_end(i, bool(info["success"][i]))
+        if self.render_mode == "human":
+            self.render()
         return obs, np.where(diverged, 0.0, reward), terminated, truncated, info
 
-    def _simulate(self, command: Array) -> Array:
+    def record_end(self, i: int, success: bool) -> None:
+        """Keep a failed start for retry; with curriculum, raise the difficulty with success."""
+        self.recent_success.append(success)
+        if not success:
+            self.failures[i].append(self.starts[i])
+        full = len(self.recent_success) == self.recent_success.maxlen
+        if self.options["curriculum"] and full and np.mean(self.recent_success) > 0.5:
+            self.difficulty = min(1.0, self.difficulty + 0.05)
+            self.recent_success.clear()
+
+    def simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
-        self._ctrl[:, :8] = self._ctrl[:, 8:] = command
+        self.ctrl[:] = np.tile(command, 2)  # of the velocity servos and of their integrators
         failed = np.zeros(self.num_envs, bool)
         # Anti-windup: the integrator leads its joint by no more than the force limit can use.
         # At zero command this lead goes on squeezing the log as a check valve would. Decisions
         # shorter than ANTI_WINDUP share a clamp, counted from the start of the crane's episode.
-        due = self._decisions % max(1, ANTI_WINDUP // self.frame_skip) == 0
+        due = self.decisions % max(1, ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, ANTI_WINDUP):
-            position = self._qpos[:, self._servo_q]
-            low, high = position - self._max_lead, position + self._max_lead
-            np.clip(self._act, low, high, out=self._act, where=due[:, None])
+            position = self.qpos[:, SERVOS]
+            low, high = position - self.max_lead, position + self.max_lead
+            np.clip(self.act, low, high, out=self.act, where=due[:, None])
             nstep = min(ANTI_WINDUP, self.frame_skip - start)
-            # Sensors are read after the last; where a clamp follows they would be computed in vain.
+            # sensors are needed after the last physics step only
             last = start + nstep == self.frame_skip
             stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
             try:
                 self.batch.step(nstep=nstep, stage=stage)
             except SimulationError as error:
                 failed[error.ids] = True
-        finite = np.isfinite(self._qpos).all(axis=-1) & np.isfinite(self._qvel).all(axis=-1)
+        finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
         return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
 
-    def _start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
-        """New episodes in cranes `ids`, and what all cranes observe then."""
+    def start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
+        """New episodes in cranes `ids`; observations and info of all cranes."""
         for i in ids:
-            (start_rng, noise_rng), failures = self._rngs[i], self._failures[i]
-            if self.retry and failures and start_rng.random() < self.retry:
-                self._starts[i] = failures[start_rng.integers(len(failures))]
+            (start_rng, noise_rng), failures = self.rngs[i], self.failures[i]
+            retry = self.options["retry"]
+            if retry and failures and start_rng.random() < retry:
+                self.starts[i] = failures[start_rng.integers(len(failures))]
             else:
-                self._starts[i] = sample_start(start_rng, self.difficulty)
-            self._noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self._noise[i].shape)
-        q, log_pose, diameter = map(np.array, zip(*[self._starts[i] for i in ids]))
+                self.starts[i] = sample_start(start_rng, self.difficulty)
+            self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
+        q, log_pose, diameter = (np.array(part) for part in zip(*[self.starts[i] for i in ids]))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
-        return self._observe(self._state(), np.zeros((self.num_envs, 6)))
+        if self.render_mode == "human":
+            self.render()
+        return self.observe(self.state(), np.zeros((self.num_envs, 6)))
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
@@ -532,13 +576,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
         self.batch.joint("log").qpos[ids] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
-        self._qpos[np.ix_(ids, self._q)] = q
-        self._qpos[np.ix_(ids, self._servo_q)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
+        self.qpos[np.ix_(ids, JOINTS)] = q
+        self.qpos[np.ix_(ids, SERVOS)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
 
         mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
         log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
-        self._log_size[ids, 0] = capsule.size[ids, 0] = radius
+        self.log_size[ids, 0] = capsule.size[ids, 0] = radius
         capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
         log.mass[ids, 0] = mass
         log.inertia[ids] = np.stack([across, across, along], axis=-1)
@@ -546,31 +590,32 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         # the integrators start with the static load, so that an idle crane neither sags nor swings
-        load = self._bias[np.ix_(ids, self._servo_dq)]
-        self._act[ids] = self._qpos[np.ix_(ids, self._servo_q)] + load / self._servo_kp
-        self._decisions[ids] = 0
-        self._reach_time[ids] = np.inf
-        self._streaks[:, ids] = 0
+        load = self.qfrc_bias[np.ix_(ids, SERVOS)]
+        self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp
+        self.decisions[ids] = 0
+        self.reach_time[ids] = np.inf
+        self.streaks[:, ids] = 0
 
-    def _state(self) -> CraneState:
-        q, dq, diameter = self._qpos[:, self._q], self._qvel[:, self._dq], 2 * self._log_size[:, 0]
-        s = self._sensors.copy()  # in their order in crane.xml; the last two are of touch
-        poses = s[:, :3], s[:, 3:6], s[:, 6:9], s[:, 9:12]
-        return CraneState(q, dq, *poses, s[:, 12:] > 0, diameter)
+    def state(self) -> CraneState:
+        """A copy of the state of all cranes."""
+        q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
+        *poses, touch = np.split(self.sensordata.copy(), [3, 6, 9, 12], axis=1)  # as in crane.xml
+        return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0])
 
-    def _observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
+    def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
         """Observations (N, 18), float32, inside the observation space; what `info` says of them."""
-        delta_p, delta_psi, signed_angle = relative_pose(state, self.offset)
+        delta_p, delta_psi, signed_angle = relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
         clearance, miss = log_clearance(state), centre_miss(state)
-        terms = reward_terms(state, d_combine, clearance, miss, command, self.reward, self.omega2)
-        info = dict(zip(("r_distance", "r_grapple", "r_lift", "r_balance"), terms))
-        info |= {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
-        angle = signed_angle if self.signed_yaw else delta_psi
-        if self.pose_noise != "none":
-            now = np.minimum(self._decisions, self._noise.shape[1] - 1)
-            delta_p, angle = noisy_pose(delta_p, angle, self._noise[np.arange(len(now)), now])
-        if self.axes == "crane":
+        kind = self.options["reward"]
+        info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
+        terms = reward_terms(state, d_combine, clearance, miss, command, kind)
+        info |= dict(zip(TERMS, terms))
+        angle = signed_angle if self.options["signed_yaw"] else delta_psi
+        if self.options["pose_noise"] != "none":
+            now = np.minimum(self.decisions, self.noise.shape[1] - 1)
+            delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
+        if self.options["axes"] == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
         obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
@@ -582,7 +627,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
         if self.render_mode == "rgb_array":
             if self.viewer is None:
-                self.viewer = mujoco.Renderer(self.batch.get_model(0), *self._frame_size)
+                self.viewer = mujoco.Renderer(self.batch.get_model(0), *self.frame_size)
             frames = []
             for i in range(self.num_envs):
                 self.batch.get_model(i, self.viewer.model)
@@ -620,14 +665,10 @@ class CraneEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
-        if self.render_mode == "human":
-            self.render()
         return obs[0], {key: value[0] for key, value in info.items()}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.envs.advance(np.asarray(action)[None])
-        if self.render_mode == "human":
-            self.render()
         info = {key: value[0] for key, value in info.items()}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
@@ -639,6 +680,109 @@ class CraneEnv(gymnasium.Env):
         self.envs.close()
 
 
-gymnasium.register(
-    "ForestryCrane-v0", "crane_env:CraneEnv", vector_entry_point="crane_env:CraneVectorEnv"
-)
+CLASSES = {"entry_point": "crane_env:CraneEnv", "vector_entry_point": "crane_env:CraneVectorEnv"}
+gymnasium.register("ForestryCrane-v0", **CLASSES)
+gymnasium.register("ForestryCranePaper-v0", kwargs=PAPER, **CLASSES)
+
+
+# ---- training and judging
+
+
+def is_crane(env_id: str) -> bool:
+    """Whether the task is this crane or a subclass of it: `CraneVectorEnv` steps it."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    creator = gymnasium.spec(name).vector_entry_point
+    creator = load_env_creator(creator) if isinstance(creator, str) else creator
+    return isinstance(creator, type) and issubclass(creator, CraneVectorEnv)
+
+
+def make_envs(
+    env_id: str, num_envs: int, env_threads: int = 0, **options: Any
+) -> gymnasium.vector.VectorEnv:
+    """N environments of any Gymnasium task, with SAME_STEP autoreset and `info["episode"]`.
+
+    env_threads and options are the crane's. Other tasks refuse options, except retry.
+    """
+    if is_crane(env_id):
+        envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)
+    elif unknown := options.keys() - {"retry"}:
+        raise ValueError(f"{env_id} is not the crane and has no option {', '.join(unknown)}")
+    else:
+        autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        envs = gymnasium.make_vec(env_id, num_envs, "sync", vector_kwargs=autoreset)
+    for space in (envs.single_observation_space, envs.single_action_space):
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise ValueError("its observations or actions are no flat Box")
+    return RecordEpisodeStatistics(envs)
+
+
+def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[str, float]:
+    """What TensorBoard shows of a rollout of `make_envs`, from the `info` of each of its steps."""
+    report, crane = {}, envs.unwrapped
+    ends = [(info, i) for info in infos if "episode" in info for i in info["_episode"].nonzero()[0]]
+    if ends:
+        report["charts/episodic_return"] = np.mean([info["episode"]["r"][i] for info, i in ends])
+        report["charts/episodic_length"] = np.mean([info["episode"]["l"][i] for info, i in ends])
+    if isinstance(crane, CraneVectorEnv):
+        report["charts/success_rate"] = np.mean(crane.recent_success or [0.0])
+        report["charts/difficulty"] = crane.difficulty
+        report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
+        endings = [info["termination"][i] for info, i in ends]
+        for name in TERMINATIONS:
+            report[f"termination/{name}"] = endings.count(name) / max(1, len(endings))
+    return report
+
+
+def monte_carlo_trials(
+    seed: int, trials: int, diameters: Sequence[float] = DIAMETERS
+) -> tuple[Array, list[SeedSequence]]:
+    """Diameters (m) and seeds of trials per diameter, for `CraneVectorEnv` and its `reset`.
+
+    Trial k at a diameter is the same whatever the number of trials and the other diameters.
+    """
+    keys = [(round(1000 * d), k) for d in diameters for k in range(trials)]
+    return np.repeat(diameters, trials), [SeedSequence(seed, spawn_key=key) for key in keys]
+
+
+def run_trials(
+    policy: Any, envs: gymnasium.vector.VectorEnv, seeds: Any, deterministic: bool = True
+) -> dict[str, Array]:
+    """One whole episode in each environment of `make_envs`: RESULTS, (N,) each.
+
+    policy.predict(obs (N, obs_dim), state, deterministic=...) gives actions (N, act_dim) and the
+    next state. The first state is None. Stable-Baselines3's models have this method too.
+    """
+    obs, _ = envs.reset(seed=seeds)
+    results, state, ended = {}, None, np.zeros(envs.num_envs, bool)
+    while not ended.all():
+        actions, state = policy.predict(obs, state, deterministic=deterministic)
+        obs, _, terminated, truncated, info = envs.step(actions)
+        first = (terminated | truncated) & ~ended  # later ends are of episodes after the trial
+        if first.any():
+            info["episodic_return"] = info["episode"]["r"]
+            for name in info.keys() & RESULTS:
+                results.setdefault(name, np.zeros_like(info[name]))[first] = info[name][first]
+        ended |= first
+    return results
+
+
+def evaluate(
+    policy: Any, env_id: str, trials: int, seed: int, env_threads: int = 0, **options: Any
+) -> dict[str, float]:
+    """Mean return and success rates in trials per diameter (other tasks: trials in all)."""
+    if is_crane(env_id):
+        diameters, seeds = monte_carlo_trials(seed, trials)
+        options |= {"diameter": diameters, "retry": 0.0, "curriculum": False, "difficulty": 1.0}
+        envs = make_envs(env_id, len(seeds), env_threads, **options)
+    else:
+        envs, seeds = make_envs(env_id, trials), seed
+    results = run_trials(policy, envs, seeds)
+    envs.close()
+    scores = {"episodic_return": results["episodic_return"].mean()}
+    if "success" in results:
+        scores["success_rate"] = results["success"].mean()
+        for d in DIAMETERS:
+            scores[f"success_rate_{d}m"] = results["success"][diameters == d].mean()
+    return scores

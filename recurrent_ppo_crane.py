@@ -1,50 +1,46 @@
-"""Recurrent PPO: proximal policy optimisation with a memory, an LSTM, on the crane.
+"""Recurrent PPO: proximal policy optimization with an LSTM as memory, on the crane.
 
 The paper's third baseline (Vu et al., Sec. IV-B), after Schulman et al., 2017, and Hochreiter and
-Schmidhuber, 1997. What one observation does not tell, the log's diameter or how fast the grapple
-swings, the policy may infer from what it remembers:
+Schmidhuber, 1997. One observation does not tell the log's diameter or how fast the grapple swings.
+A policy with a memory can infer both:
 
-- h_t, c_t = LSTM(o_t, h_{t-1}, c_{t-1}), both 0 before the first observation of an episode;
-- a ~ N(mu(o_t, h_t), sigma^2) and V(o_t, h_t), otherwise as in PPO;
-- a minibatch holds whole sequences, the rollouts of some of the cranes; each starts from the state
-  that its crane had when the rollout began.
+- h_t, c_t = LSTM(o_t, h_{t-1}, c_{t-1}). Both are 0 before the first observation of an episode.
+- The policy is a ~ N(mu(o_t, h_t), sigma^2), the value is V(o_t, h_t). The rest is PPO.
+- A minibatch holds the whole rollouts of some of the cranes. Each of these sequences starts from
+  the state that its crane had when the rollout began.
 
-With generalised advantage estimation:
+With generalized advantage estimation:
 
-    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)      V(s_{t+1}) is 0 where an episode terminated and
-    A_t     = delta_t + gamma lambda A_{t+1}       V(final_obs) where the time limit cut it;
-                                                   A_{t+1} is 0 where an episode ended
+    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)         A_t = delta_t + gamma lambda A_{t+1}
+    rho     = pi(a | s) / pi_old(a | s)               R   = A + V_old
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
-    rho     = pi(a | s) / pi_old(a | s),  R = A + V_old
 
-Three things change along a run (why: benchmark/README.md). Exploration narrows by itself, for noise
-in joint speeds shakes the hanging grapple. The horizon 1 / (1 - gamma) grows, for a short one soon
-learns to lift and a long one takes time over its grip. The step size falls to 0.
+Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
+V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
 
-    python recurrent_ppo_crane.py                      # the forestry crane, on two cores
-    python recurrent_ppo_crane.py --env-id Pendulum-v1 --gamma 0.9 --horizon-growth 1
-    python recurrent_ppo_crane.py --resume runs/<run>
+Along the run the policy narrows, the horizon grows, the step size falls (docs/recurrent_ppo.md).
+
+    python recurrent_ppo_crane.py                      # the crane: minutes on two cores
+    python recurrent_ppo_crane.py --resume runs/<run>  # continue a run that was stopped
+    python recurrent_ppo_crane.py --env-id Pendulum-v1 --num-envs 8
 """
 
 import os
 import signal
-import sys
 import time
-from collections import deque
-from dataclasses import asdict, dataclass
+from collections import defaultdict
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-# Waiting threads look 5,000 times, then sleep: fast alone, and two runs at once do not stall.
+# OpenMP workers spin briefly before they sleep: low latency, and two runs can share two cores.
 os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 import gymnasium
 import numpy as np
 import torch
 import tyro
-from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor, nn
 from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
@@ -53,89 +49,52 @@ from tqdm import trange
 import crane_env
 
 ALGORITHM = "recurrent_ppo"
-MACHINE_ARGS = ("resume", "device", "torch_threads", "env_threads")  # not taken from a checkpoint
-
+SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
 State = tuple[Tensor, Tensor]  # h and c of the LSTM, (N, lstm_size) each
 
 
 @dataclass
 class Args:
-    # --- experiment
+    # experiment
     exp_name: str = "recurrent_ppo_crane"  # name of the run's folder
-    seed: int = 1  # seed of network, policy samples and episodes
-    total_timesteps: int = 1_024_000  # decisions to train for, over all cranes, in whole rollouts
+    seed: int = 1  # seed of the networks, the policy's samples and the episodes
+    total_timesteps: int = 1_024_000  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 1  # CPU threads of an update; its LSTM steps are too small for two
-    resume: str | None = None  # run's folder to go on in; it sets all but device and threads
-    paper: bool = False  # take the paper's protocol (days of training) as defaults
+    torch_threads: int = 1  # CPU threads of an update; the LSTM's steps are too small for two
+    env_threads: int = 2  # CPU threads of the physics, 0 for all cores
+    resume: Path | None = None  # folder of a run to continue, with its own arguments
 
-    # --- environment
+    # task
     env_id: str = "ForestryCrane-v0"  # or any Gymnasium task with flat Box spaces
     num_envs: int = 64  # cranes simulated side by side
-    env_threads: int = 2  # physics threads, 0 for all cores
-    frame_skip: int = 20  # physics steps of 5 ms per decision
-    contact: Literal["primitive", "sdf"] = "primitive"  # contact model of jaws and log
-    reward: Literal["staged", "paper"] = "staged"  # staged, or as printed in the paper
-    omega2: float = 1.0  # sharpness of r_distance and r_grapple [1/m]
-    speed: Literal["real", "mjcf"] = "real"  # joint speed limits
-    offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
-    signed_yaw: bool = True  # observe the signed angle to the log, not the paper's Delta_psi
-    axes: Literal["crane", "world"] = "crane"  # of Delta_p; crane: along the boom, to its left, up
-    pose_noise: Literal["none", "step", "episode"] = "none"  # error of the observed log pose
-    integrator: Literal["implicitfast", "implicit", "discrete", "Euler"] = "implicitfast"
-    """MuJoCo integrator"""
-    solver: Literal["Newton", "CG"] = "Newton"  # MuJoCo constraint solver
-    retry: float = 0.0  # share of episodes that start as a recent failure of that crane did
-    curriculum: bool = False  # raise the task's difficulty from 0 to 1 with the success rate
+    env: crane_env.Options = field(default_factory=lambda: {"retry": 0.0})
+    """options of the crane; in parentheses: what ForestryCrane-v0 has"""
 
-    # --- algorithm
+    # algorithm
     num_steps: int = 64  # decisions per crane and rollout
-    hidden_sizes: tuple[int, ...] = (256, 256)  # width of each hidden layer, of actor and of critic
+    hidden_sizes: tuple[int, ...] = (256, 256)  # hidden layers of the actor and of the critic
+    lstm_size: int = 64  # width of the memory that actor and critic read
     normalize_obs: bool = True  # scale observations by their running mean and deviation
-    lstm_size: int = 64  # width of the memory that both read
-    learning_rate: float = 7e-4  # Adam's step size
-    anneal_lr: bool = True  # lower the step size linearly to 0
-    gamma: float = 0.97  # discount per 0.1 s at the start; other decision rates rescale it
-    horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run; 1: it stays
+    learning_rate: float = 7e-4  # Adam's step size at the start
+    gamma: float = 0.97  # discount per 0.1 s at the start
+    horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run
     gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    bootstrap: bool = True  # count V(final_obs) where the time limit cuts an episode; off: 0
     reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
-    num_minibatches: int = 4  # groups of cranes, each one gradient step on their whole rollouts
+    num_minibatches: int = 4  # groups of cranes; one gradient step on the rollouts of each
     update_epochs: int = 8  # passes over each rollout
     clip_coef: float = 0.2  # c, bound of the ratio's change
-    target_kl: float | None = 0.04  # an update ends with the epoch whose mean KL passes this
+    target_kl: float | None = 0.04  # stop after the first epoch whose mean KL estimate exceeds this
     ent_coef: float = 0.0  # c_e, weight of the entropy
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
     log_std_init: float = -1.2  # log sigma at the start [action units]
-    narrowing: float = 1.25  # by which it sinks along the run, whatever is learned; 0: it does not
+    narrowing: float = 1.25  # fall of log sigma along the run, whatever is learned
 
-    # --- reports
-    eval_every: int = 50  # updates between two deterministic evaluations, 0 for none
-    eval_trials: int = 20  # trials per log diameter in each (other tasks: episodes)
-    final_trials: int = 100  # trials per log diameter after training, 0 for none
-    eval_seed: int = 10_000  # seed of all evaluation trials
-
-
-LEAST = {  # the smallest values of arguments that have one
-    0: "seed env_threads learning_rate eval_every final_trials eval_seed reward_scale omega2 "
-    "max_grad_norm vf_coef clip_coef",
-    1: "total_timesteps torch_threads num_envs frame_skip num_steps hidden_sizes horizon_growth "
-    "lstm_size num_minibatches update_epochs eval_trials",
-}
-
-# What the paper states (Sec. IV); what it leaves open is guessed and named when it runs.
-PAPER = """
---paper --total-timesteps 500_000_000 --num-envs 42 --frame-skip 1 --contact sdf --reward paper
---offset minus --no-signed-yaw --axes world --integrator implicit --solver CG --num-steps 1000
---hidden-sizes 256 256 256 256 --learning-rate 3e-4 --no-anneal-lr --gamma 0.99 --horizon-growth 1
---reward-scale 0.02 --log-std-init -0.5 --narrowing 0 --num-minibatches 21 --update-epochs 30
---target-kl None
-"""
-PAPER_GUESSES = """Paper's protocol. Unpublished, so guessed (their values: --help --paper): gamma,
-lambda, clip range, minibatches, reward scale, weights of value loss and entropy, gradient bound,
-LSTM units, tanh units, no annealing, normalised observations and advantages, sigma at the start,
-omega 1-3 = 1, z_l,d = 1 m, speed limits "real", start of an episode, its length (9 s, not 15 s)."""
+    # evaluation
+    eval_every: int = 50  # updates between two evaluations of the mean action, 0 for none
+    eval_trials: int = 20  # trials per log diameter in each evaluation
+    final_trials: int = 100  # trials per log diameter after the training, 0 for none
+    eval_seed: int = 10_000  # seed of all trials
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -144,30 +103,30 @@ def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
     return layer
 
 
+def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for width in hidden_sizes:
+        layers += [layer_init(nn.Linear(inputs, width)), nn.Tanh()]
+        inputs = width
+    return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
+
+
 class Agent(nn.Module):
-    """Actor, critic and the observation normaliser, all in one state_dict."""
+    """Actor, critic and observation normalizer. Only `predict` takes raw observations."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
-        act_dim = len(action_low)
+        self.normalize_obs = args.normalize_obs
         features = obs_dim + args.lstm_size
         self.lstm = nn.LSTM(obs_dim, args.lstm_size)
-        self.actor = self._network(features, args.hidden_sizes, act_dim, std=0.01)
-        self.log_std = nn.Parameter(torch.full((act_dim,), args.log_std_init))
-        self.critic = self._network(features, args.hidden_sizes, 1, std=1.0)
+        self.actor = mlp(features, args.hidden_sizes, len(action_low), std=0.01)
+        self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
+        self.critic = mlp(features, args.hidden_sizes, 1, std=1.0)
         self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
         self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(1e-4, dtype=torch.float64))
-
-    @staticmethod
-    def _network(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) -> nn.Module:
-        layers: list[nn.Module] = []
-        for width in hidden_sizes:
-            layers += [layer_init(nn.Linear(inputs, width)), nn.Tanh()]
-            inputs = width
-        return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
 
     def update_normalizer(self, obs: Tensor) -> None:
         """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
@@ -180,25 +139,28 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std within +-10, what the networks take; `predict` takes raw ones."""
+        """(obs - mean) / std, clipped to +-10; obs itself without normalize_obs."""
+        if not self.normalize_obs:
+            return obs
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
     def initial_state(self, num_envs: int) -> State:
-        zeros = self.obs_mean.new_zeros((2, num_envs, self.lstm.hidden_size), dtype=torch.float32)
-        return zeros[0], zeros[1]
+        """Empty memories of num_envs cranes."""
+        h, c = torch.zeros((2, num_envs, self.lstm.hidden_size), device=self.obs_mean.device)
+        return h, c
 
     def remember(self, obs: Tensor, state: State, starts: Tensor) -> tuple[Tensor, State]:
-        """Features of obs (T, N, obs_dim) with the memory of what came before, and the last state.
+        """Features (T, N, obs_dim + lstm_size) of obs (T, N, obs_dim), and the last state.
 
-        state: h and c, (N, lstm_size), before obs[0]. starts (T, N) is 1 where obs begins an
-        episode, whose memory is empty.
+        state: h and c before obs[0]. starts (T, N) is 1 where obs begins an episode, and empties
+        the memory there.
         """
         h, c = (part[None] for part in state)
         resets = 1 + starts[1:].any(dim=1).nonzero().flatten()
         cuts = [0, *resets.tolist(), len(obs)]
         memories = []
-        for begin, end in pairwise(cuts):  # inside a piece nn.LSTM goes from step to step by itself
+        for begin, end in pairwise(cuts):  # no episode starts inside a piece
             keep = (1 - starts[begin])[:, None]
             memory, (h, c) = self.lstm(obs[begin:end], (keep * h, keep * c))
             memories.append(memory)
@@ -209,385 +171,259 @@ class Agent(nn.Module):
         return self.critic(features).squeeze(-1)
 
     def get_distribution(self, features: Tensor) -> Normal:
-        """Gaussian over actions, batch shape (..., act_dim), before clipping to the limits."""
+        """Gaussian over actions before clipping, batch shape (..., act_dim)."""
         mean = self.actor(features)
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
 
-    def predict(
-        self, obs: Tensor, state: State, deterministic: bool = True
-    ) -> tuple[Tensor, State]:
-        """Actions (N, act_dim) in the environment's units, and the state that follows."""
-        x, starts = self.normalize(obs)[None], torch.zeros(1, len(obs)).to(obs)
-        features, state = self.remember(x, state, starts)
-        distribution = self.get_distribution(features[0])
-        actions = distribution.mean if deterministic else distribution.sample()
-        return self.to_env(actions), state
+    def to_env(self, actions: Tensor) -> np.ndarray:
+        """Actions clipped to the environment's limits."""
+        return actions.clamp(self.action_low, self.action_high).cpu().numpy()
 
-    def to_env(self, actions: Tensor) -> Tensor:
-        return torch.clamp(actions, self.action_low, self.action_high)
+    @torch.no_grad()
+    def predict(
+        self, obs: np.ndarray, state: State | None = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, State]:
+        """Actions (B, act_dim) for raw obs (B, obs_dim), and the state of the memory after them."""
+        obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
+        state = self.initial_state(len(obs)) if state is None else state
+        no_starts = torch.zeros(1, len(obs), device=obs.device)
+        features, state = self.remember(self.normalize(obs)[None], state, no_starts)
+        distribution = self.get_distribution(features[0])
+        return self.to_env(distribution.mean if deterministic else distribution.sample()), state
 
 
 def compute_gae(
-    rewards: Tensor, values: Tensor, last_value: Tensor, dones: Tensor, gamma: float, lam: float
+    rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values and episode ends (T, N), and what follows them (N,).
+    """Advantages (T, N) from rewards, values, episode ends (T, N) and the value after them (N,).
 
-    Nothing follows an end; gamma V(final_obs) of one by the time limit is part of its reward.
+    No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
+    already added gamma * V(final_obs) to the reward.
     """
-    next_values = torch.cat([values[1:], last_value[None]]) * (1 - dones)
     advantages = torch.zeros_like(rewards)
-    last = torch.zeros_like(rewards[0])
+    next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
-        delta = rewards[t] + gamma * next_values[t] - values[t]
-        last = delta + gamma * lam * (1 - dones[t]) * last
-        advantages[t] = last
+        going_on = 1 - dones[t]
+        delta = rewards[t] + gamma * next_value * going_on - values[t]
+        advantages[t] = next_advantage = delta + gamma * lam * going_on * next_advantage
+        next_value = values[t]
     return advantages
 
 
-def crane_kwargs(args: Args) -> dict:
-    """The crane environment's arguments among args."""
-    names = ["frame_skip", "contact", "reward", "omega2", "speed", "offset", "signed_yaw"]
-    names += ["axes", "pose_noise", "integrator", "solver", "env_threads"]
-    return {name: getattr(args, name) for name in names}
-
-
-def is_crane(args: Args) -> bool:
-    return args.env_id.startswith("ForestryCrane")
-
-
-def make_envs(args: Args, num_envs: int, **kwargs) -> gymnasium.vector.VectorEnv:
-    if is_crane(args):
-        return gymnasium.make_vec(args.env_id, num_envs, **crane_kwargs(args), **kwargs)
-    autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    return gymnasium.make_vec(args.env_id, num_envs, "sync", vector_kwargs=autoreset)
-
-
-def evaluate(agent: Agent, args: Args, trials: int) -> dict[str, float]:
-    """Mean return, and for the crane success rates, of the mean action; trials per log diameter."""
-    if is_crane(args):
-        diameters, seeds = crane_env.monte_carlo_trials(args.eval_seed, trials)
-        envs = make_envs(args, len(seeds), diameter=diameters)
-        obs, _ = envs.reset(seed=seeds)
-    else:
-        envs = make_envs(args, trials)
-        obs, _ = envs.reset(seed=args.eval_seed)
-    returns, success = np.zeros(len(obs)), np.zeros(len(obs), bool)
-    ended = np.zeros(len(obs), bool)
-    state = agent.initial_state(len(obs))
-    while not ended.all():
-        with torch.no_grad():
-            obs = torch.as_tensor(obs, dtype=torch.float32, device=args.device)
-            actions, state = agent.predict(obs, state)
-        obs, reward, terminated, truncated, info = envs.step(actions.cpu().numpy())
-        returns += np.where(ended, 0, reward)
-        if is_crane(args):
-            success |= info["success"] & ~ended
-        ended |= terminated | truncated
-    envs.close()
-    result = {"eval/episodic_return": returns.mean()}
-    if is_crane(args):
-        result["eval/success_rate"] = success.mean()
-        for d in np.unique(diameters):
-            result[f"eval/success_rate_{d:.1f}m"] = success[diameters == d].mean()
-    return result
-
-
-def save_atomically(contents: dict, path: Path) -> None:
-    torch.save(contents, path.with_suffix(".tmp"))
-    os.replace(path.with_suffix(".tmp"), path)
+def load_checkpoint(args: Args) -> tuple[dict, Args]:
+    """checkpoint.pt of the run to resume and the run's arguments, except those of the machine."""
+    path = args.resume / "checkpoint.pt"
+    if not path.is_file():
+        raise SystemExit(f"--resume takes the folder of a run, and there is no {path}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        assert checkpoint["algorithm"] == ALGORITHM
+        assert checkpoint["task"]["revision"] == crane_env.REVISION
+        machine = ("resume", "device", "torch_threads", "env_threads")
+        return checkpoint, Args(**checkpoint["args"] | {k: getattr(args, k) for k in machine})
+    except Exception:  # a damaged file raises many kinds
+        raise SystemExit(f"--resume: {path} is damaged or of another script or task") from None
 
 
 if __name__ == "__main__":
-    default = tyro.cli(Args, args=PAPER.split()) if "--paper" in sys.argv else Args()
-    args = tyro.cli(Args, description=__doc__, default=default)
+    args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     checkpoint = None
     if args.resume is not None:
-        path = Path(args.resume)
-        path = path / "checkpoint.pt" if path.is_dir() else path
-        try:
-            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-            saved, task = checkpoint["args"], checkpoint["task"]
-            ours = checkpoint["algorithm"] == ALGORITHM and "optimizer" in checkpoint
-            ours &= task == crane_env.REVISION and saved.keys() == asdict(args).keys()
-        except OSError as error:
-            raise SystemExit(f"--resume: {error}") from None
-        except Exception:  # whatever a file that is no checkpoint may raise
-            ours = False
-        if not ours:
-            raise SystemExit(f"--resume: {path} is no checkpoint.pt of today's {ALGORITHM}")
-        args = Args(**saved | {name: getattr(args, name) for name in MACHINE_ARGS})
-        print(f"all arguments but {', '.join(MACHINE_ARGS[1:])} are those of {path}")
-    elif args.paper:
-        print(PAPER_GUESSES)
-    for least, names in LEAST.items():
-        for name in names.split():
-            if not np.all(np.asarray(getattr(args, name)) >= least):
-                raise SystemExit(f"--{name.replace('_', '-')} must be at least {least}")
-    if not (0 <= args.gamma <= 1 and 0 <= args.gae_lambda <= 1):
-        raise SystemExit("--gamma and --gae-lambda must lie in [0, 1]")
-    if args.num_envs % args.num_minibatches:
-        raise SystemExit(
-            "--num-envs must be a multiple of --num-minibatches: cranes are shared out"
-        )
-    batch_size = args.num_envs * args.num_steps
-    if batch_size // args.num_minibatches < 2:
-        raise SystemExit("--num-minibatches leaves one sample alone, with no standard deviation")
-    num_iterations = max(1, args.total_timesteps // batch_size)
-    # gamma, lambda and the reward scale are stated per 0.1 s
-    tenths = args.frame_skip / 20 if is_crane(args) else 1.0
-    gae_lambda = args.gae_lambda**tenths
-
-    torch.manual_seed(args.seed)
-    torch.set_num_threads(args.torch_threads)  # rounding, of the first weights too, depends on it
-    device = torch.device(args.device)
+        checkpoint, args = load_checkpoint(args)
     if args.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("--device cuda: torch finds no GPU here; use --device cpu")
+        raise SystemExit("--device cuda: torch finds no GPU; use --device cpu")
+    device = torch.device(args.device)
+    batch_size = args.num_envs * args.num_steps
+    num_iterations = max(1, args.total_timesteps // batch_size)
+    if args.num_envs % args.num_minibatches or batch_size < 2 * args.num_minibatches:
+        raise SystemExit(
+            "--num-envs must be a multiple of --num-minibatches, rollouts longer than 1"
+        )
 
+    def to_tensor(x: np.ndarray) -> Tensor:
+        return torch.as_tensor(x, dtype=torch.float32, device=device)
+
+    # Environments
     try:
-        envs = make_envs(args, args.num_envs, retry=args.retry)
-        envs = RecordEpisodeStatistics(envs, buffer_length=200)  # info["episode"], return_queue
+        envs = crane_env.make_envs(args.env_id, args.num_envs, args.env_threads, **args.env)
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    spaces = (obs_space, action_space)
-    if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
-        raise SystemExit(f"--env-id: {args.env_id} has no flat Box observations and actions")
+    is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
+    tenths = envs.unwrapped.dt / 0.1 if is_crane else 1.0  # of a second in a decision
+
+    # Agent
+    torch.manual_seed(args.seed)
+    torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-
-    first_iteration = 1
-    difficulty = 0.0 if args.curriculum else 1.0
+    first_iteration = 1 if checkpoint is None else checkpoint["iteration"] + 1
+    env_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
     if checkpoint is not None:
         agent.load_state_dict(checkpoint["weights"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first_iteration = checkpoint["iteration"] + 1
-        if first_iteration > num_iterations:
-            print("all updates of this run are done: only a final evaluation is made again")
-        difficulty = checkpoint["difficulty"]
-        run_dir = path.parent
-    else:
-        started = f"{int(time.time())}_{os.getpid()}"
-        run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{started}"
-        run_dir = Path("runs") / run_name.replace("/", "-")
+        torch.manual_seed(env_seed)  # new episodes and new samples
+        if is_crane:
+            envs.unwrapped.difficulty = checkpoint["difficulty"]
+
+    # Files
+    run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
+    run_dir = Path("runs", run_name.replace("/", "-")) if args.resume is None else args.resume
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
-    rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
-    writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + rows)
+    writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
+    options = envs.unwrapped.options if is_crane else {}
+    task = {"env_id": args.env_id, "revision": crane_env.REVISION, **options}
 
     def save(iteration: int) -> None:
+        """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
         weights = agent.state_dict()
-        policy = {  # acts without the critic
-            "algorithm": ALGORITHM,
-            "task": crane_env.REVISION,
-            "args": asdict(args),
-            "weights": {k: v for k, v in weights.items() if not k.startswith("critic.")},
-            "global_step": iteration * batch_size,
-        }
-        writer.flush()
-        save_atomically(policy, run_dir / "policy.pt")
-        state = {
-            "weights": weights,
-            "optimizer": optimizer.state_dict(),
-            "iteration": iteration,
-            "difficulty": difficulty,
-        }
-        save_atomically(policy | state, run_dir / "checkpoint.pt")
+        actor = {name: w for name, w in weights.items() if not name.startswith("critic.")}
+        policy = {"algorithm": ALGORITHM, "task": task, "args": asdict(args) | {"resume": None}}
+        policy |= {"weights": actor, "global_step": iteration * batch_size}  # acts without a critic
+        state = {"weights": weights, "optimizer": optimizer.state_dict(), "iteration": iteration}
+        state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0
+        for name, contents in (("policy", policy), ("checkpoint", policy | state)):
+            torch.save(contents, run_dir / f"{name}.tmp")  # a kill leaves the old file whole
+            os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
 
+    def evaluate(name: str, trials: int, global_step: int) -> dict[str, float]:
+        how = (args.env_id, trials, args.eval_seed, args.env_threads)
+        scores = crane_env.evaluate(agent, *how, **args.env)
+        for key, value in scores.items():
+            writer.add_scalar(f"{name}/{key}", value, global_step)
+        return scores
+
+    stop_signals: list[int] = []
+
+    def stop_after_update(signum: int, frame: object) -> None:
+        """Ctrl-C, kill or a closed terminal: finish the update. The second time: stop at once."""
+        stop_signals.append(signum)
+        signal.signal(signum, signal.SIG_DFL)
+
+    for signum in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:
+        if signal.getsignal(signum) != signal.SIG_IGN:  # nohup ignores some
+            signal.signal(signum, stop_after_update)
+
+    # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards = torch.zeros((args.num_steps, args.num_envs), device=device)
     dones = torch.zeros((args.num_steps, args.num_envs), device=device)
     starts = torch.zeros((args.num_steps, args.num_envs), device=device)
 
-    if is_crane(args):
-        envs.unwrapped.difficulty = difficulty
-    # A resumed run meets other episodes and samples than the interrupted run has met.
-    reset_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
-    if checkpoint is not None:
-        torch.manual_seed(reset_seed)
-    next_obs, _ = envs.reset(seed=reset_seed)
-    next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
+    next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
-    recent_success = deque(maxlen=200)
-    start_time = time.time()
-    stopping = False
+    iterations = {"initial": first_iteration - 1, "total": num_iterations}
+    progress = trange(first_iteration, num_iterations + 1, **iterations)
+    for iteration in progress:
+        # Schedules
+        left = 1.0 - (iteration - 1.0) / num_iterations
+        optimizer.param_groups[0]["lr"] = left * args.learning_rate
+        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)
+        gamma = (1 - (1 - args.gamma) / growth) ** tenths
+        reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
 
-    def stop_after_update(*_) -> None:
-        """Ctrl-C: end after this update, as in the writer it may break a lock; twice: at once."""
-        global stopping
-        stopping = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    signal.signal(signal.SIGINT, stop_after_update)
-    completed = first_iteration - 1
-    progress = trange(first_iteration, num_iterations + 1, initial=completed, total=num_iterations)
-    try:
-        for iteration in progress:
-            # ---- rollout: the actor alone; values and log-probabilities follow in one batch
-            rollout_start = time.time()
-            torch.set_num_threads(1)  # more only wait for each other in its small batches
-            fraction = 1.0 - (iteration - 1.0) / num_iterations
-            if args.anneal_lr:
-                optimizer.param_groups[0]["lr"] = fraction * args.learning_rate
-            # the horizon grows after the first quarter, the reward shrinks alike: V keeps its size
-            growth = args.horizon_growth ** max(0.0, 1 - fraction / 0.75)
-            gamma = (1 - (1 - args.gamma) / growth) ** tenths
-            reward_scale = args.reward_scale * tenths / growth
-            ended: dict[str, list] = {"return": [], "length": [], "termination": []}
-            terms = {f"r_{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")}
-            cut_at, cut_obs = [], []  # (step, crane) and end of episodes cut by the time limit
-            cut_states = []  # what was remembered of them
-            first_state = state
-            for step in range(args.num_steps):
+        # Rollout
+        rollout_start = time.time()
+        torch.set_num_threads(1)  # the batches are too small for more
+        infos, first_state = [], state
+        for step in range(args.num_steps):
+            with torch.no_grad():
+                agent.update_normalizer(next_obs)
+                obs[step], starts[step] = agent.normalize(next_obs), next_start
+                features, state = agent.remember(obs[step][None], state, next_start[None])
+                actions[step] = agent.get_distribution(features[0]).sample()
+            env_actions = agent.to_env(actions[step])
+            next_obs, reward, terminated, truncated, info = envs.step(env_actions)
+            next_obs = to_tensor(next_obs)
+            rewards[step] = to_tensor(reward * reward_scale)
+            dones[step] = next_start = to_tensor(terminated | truncated)
+            infos.append(info)
+            cut = truncated & ~terminated  # by the time limit: the task itself goes on
+            if cut.any():
+                final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))[None]
+                no_starts = torch.zeros_like(final_obs[..., 0])
                 with torch.no_grad():
-                    if args.normalize_obs:
-                        agent.update_normalizer(next_obs)
-                    # kept as the policy saw it, for the normaliser moves on
-                    obs[step], starts[step] = agent.normalize(next_obs), next_start
-                    features, state = agent.remember(obs[step][None], state, next_start[None])
-                    actions[step] = agent.get_distribution(features[0]).sample()
-                    env_actions = agent.to_env(actions[step]).cpu().numpy()
-                next_obs, reward, terminated, truncated, info = envs.step(env_actions)
-                next_obs = torch.as_tensor(next_obs, dtype=torch.float32, device=device)
-                done = terminated | truncated
-                rewards[step] = torch.as_tensor(reward * reward_scale, device=device)
-                dones[step] = next_start = torch.as_tensor(done, device=device).float()
+                    features, _ = agent.remember(
+                        final_obs, (state[0][cut], state[1][cut]), no_starts
+                    )
+                    rewards[step, cut] += gamma * agent.get_value(features[0])
 
-                for i in np.flatnonzero(done):
-                    if truncated[i] and not terminated[i]:
-                        cut_at.append((step, i))
-                        last_obs = torch.as_tensor(info["final_obs"][i], dtype=torch.float32)
-                        cut_obs.append(agent.normalize(last_obs.to(device)))
-                        cut_states.append(torch.stack([part[i] for part in state]))
-                    ended["return"].append(info["episode"]["r"][i])
-                    ended["length"].append(info["episode"]["l"][i])
-                    if is_crane(args):
-                        ended["termination"].append(info["termination"][i])
-                        recent_success.append(info["success"][i])
-                if is_crane(args):
-                    for name in terms:
-                        terms[name] += info[name].mean() / args.num_steps
-            global_step = iteration * batch_size
-            update_start = time.time()
+        # Advantages
+        update_start = time.time()
+        torch.set_num_threads(args.torch_threads)
+        with torch.no_grad():
+            features, _ = agent.remember(obs, first_state, starts)
+            values = agent.get_value(features)
+            logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
+            # one step ahead, while the live state stays where it is
+            features, _ = agent.remember(agent.normalize(next_obs)[None], state, next_start[None])
+            next_value = agent.get_value(features[0])
+        advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda**tenths)
+        returns = advantages + values
 
-            # ---- advantages
-            torch.set_num_threads(args.torch_threads)
-            with torch.no_grad():
-                features, _ = agent.remember(obs, first_state, starts)
-                values = agent.get_value(features)
-                logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
-                # looks ahead of the live state, which goes on from where it is
-                ahead = agent.normalize(next_obs)[None]
-                features, _ = agent.remember(ahead, state, next_start[None])
-                last_value = agent.get_value(features[0])
-                if cut_at and args.bootstrap:
-                    last_obs = torch.stack(cut_obs)[None]
-                    h, c = torch.stack(cut_states, dim=1)
-                    no_starts = torch.zeros_like(last_obs[..., 0])
-                    features, _ = agent.remember(last_obs, (h, c), no_starts)
-                    cut_values = agent.get_value(features[0])
-                    rewards[tuple(zip(*cut_at))] += gamma * cut_values
-                advantages = compute_gae(rewards, values, last_value, dones, gamma, gae_lambda)
-                returns = advantages + values
+        # Update
+        stats = defaultdict(list)
+        for _ in range(args.update_epochs):
+            epoch_kls = []
+            cranes = torch.randperm(args.num_envs, device=device)
+            for mb in cranes.split(args.num_envs // args.num_minibatches):
+                mb_state = (first_state[0][mb], first_state[1][mb])
+                features, _ = agent.remember(obs[:, mb], mb_state, starts[:, mb])
+                distribution = agent.get_distribution(features)
+                logratio = distribution.log_prob(actions[:, mb]).sum(-1) - logprobs[:, mb]
+                ratio = logratio.exp()
+                adv = advantages[:, mb]
+                adv = (adv - adv.mean()) / (adv.std() + 1e-8)
+                clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+                policy_loss = -torch.min(adv * ratio, adv * clipped).mean()
+                value_loss = ((agent.get_value(features) - returns[:, mb]) ** 2).mean()
+                entropy = distribution.entropy().sum(-1).mean()
+                loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
 
-            # ---- update
-            stats: dict[str, list[float]] = {}
-            for _ in range(args.update_epochs):
-                cranes = torch.randperm(args.num_envs, device=device)
-                for mb in cranes.split(args.num_envs // args.num_minibatches):
-                    mb_state = tuple(part[mb] for part in first_state)
-                    features, _ = agent.remember(obs[:, mb], mb_state, starts[:, mb])
-                    distribution = agent.get_distribution(features)
-                    logratio = distribution.log_prob(actions[:, mb]).sum(-1) - logprobs[:, mb]
-                    ratio = logratio.exp()
-                    adv = advantages[:, mb]
-                    adv = (adv - adv.mean()) / (adv.std() + 1e-8)
-                    clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-                    policy_loss = -torch.min(adv * ratio, adv * clipped).mean()
-                    value_loss = ((agent.get_value(features) - returns[:, mb]) ** 2).mean()
-                    entropy = distribution.entropy().sum(-1).mean()
-                    loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
+                optimizer.zero_grad()
+                loss.backward()
+                grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+                optimizer.step()
 
-                    optimizer.zero_grad()
-                    loss.backward()
-                    grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-                    optimizer.step()
+                epoch_kls.append((ratio - 1 - logratio).mean().item())
+                stats["losses/policy_loss"].append(policy_loss.item())
+                stats["losses/value_loss"].append(value_loss.item())
+                stats["losses/entropy"].append(entropy.item())
+                stats["losses/grad_norm"].append(grad_norm.item())
+                stats["losses/old_approx_kl"].append(-logratio.mean().item())
+                stats["losses/clipfrac"].append((ratio != clipped).float().mean().item())
+                stats["policy/std"].append(agent.log_std.exp().mean().item())
+            stats["losses/approx_kl"] += epoch_kls
+            if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
+                break
+        with torch.no_grad():
+            agent.log_std -= args.narrowing / num_iterations
 
-                    with torch.no_grad():
-                        new_stats = {
-                            "losses/policy_loss": policy_loss,
-                            "losses/value_loss": value_loss,
-                            "losses/entropy": entropy,
-                            "losses/old_approx_kl": -logratio.mean(),
-                            "losses/approx_kl": (ratio - 1 - logratio).mean(),
-                            "losses/clipfrac": ((ratio - 1).abs() > args.clip_coef).float().mean(),
-                            "losses/grad_norm": grad_norm,
-                        }
-                    for name, value in new_stats.items():
-                        stats.setdefault(name, []).append(value.item())
-                epoch_kl = np.mean(stats["losses/approx_kl"][-args.num_minibatches :])
-                if args.target_kl is not None and epoch_kl > args.target_kl:
-                    break
-            with torch.no_grad():
-                stats["policy/std"] = [agent.log_std.exp().mean().item()]
-                residual_var = (returns - values).var()
-                stats["losses/explained_variance"] = [(1 - residual_var / returns.var()).item()]
-                agent.log_std -= args.narrowing / num_iterations
-            completed = iteration
+        # Reports
+        now, global_step = time.time(), iteration * batch_size
+        sps = batch_size / (now - rollout_start)
+        report = {"charts/updates": iteration}
+        report |= {name: np.mean(values) for name, values in stats.items()}
+        report |= crane_env.rollout_report(envs, infos)
+        report["losses/explained_variance"] = 1 - (advantages.var() / returns.var()).item()
+        report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
+        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * 20 * tenths}
+        report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
+        for name, value in report.items():
+            writer.add_scalar(name, value, global_step)
+        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
+        last = iteration == num_iterations
+        if iteration % 10 == 0 or last or stop_signals:
+            save(iteration)
+        if args.eval_every and (iteration % args.eval_every == 0 or last):
+            evaluate("eval", args.eval_trials, global_step)
+        if stop_signals:
+            print(f"\nstopped after update {iteration}; go on with --resume {run_dir}")
+            raise SystemExit(128 + stop_signals[0])
 
-            # ---- reports
-            now = time.time()
-            sps = (iteration - first_iteration + 1) * batch_size / (now - start_time)
-            report = {name: np.mean(values) for name, values in stats.items()}
-            report["charts/learning_rate"] = optimizer.param_groups[0]["lr"]
-            report["charts/gamma"] = gamma
-            report["charts/updates"] = iteration
-            report["charts/SPS"] = sps
-            report["time/rollout"] = update_start - rollout_start
-            report["time/update"] = now - update_start
-            if ended["return"]:
-                report["charts/episodic_return"] = np.mean(ended["return"])
-                report["charts/episodic_length"] = np.mean(ended["length"])
-            if is_crane(args):
-                report["charts/simulation_SPS"] = sps * args.frame_skip
-                report["charts/difficulty"] = difficulty
-                report |= {f"reward/{name[2:]}": value for name, value in terms.items()}
-                if ended["return"]:
-                    report["charts/success_rate"] = np.mean(recent_success)
-                    for name in crane_env.TERMINATIONS:
-                        share = np.mean(np.array(ended["termination"]) == name)
-                        report[f"termination/{name}"] = share
-                    full = len(recent_success) == recent_success.maxlen
-                    if args.curriculum and full and np.mean(recent_success) > 0.5:
-                        difficulty = min(1.0, difficulty + 0.05)
-                        envs.unwrapped.difficulty = difficulty
-                        recent_success.clear()
-            for name, value in report.items():
-                writer.add_scalar(name, value, global_step)
-            recent = {"return": envs.return_queue, "success": recent_success}
-            shown = {name: np.mean(values) for name, values in recent.items() if values}
-            progress.set_postfix({**shown, "SPS": int(sps)}, refresh=False)
-            if args.paper and iteration == first_iteration:
-                progress.write(f"estimated hours in all: {args.total_timesteps / sps / 3600:.1f}")
-            last = iteration == num_iterations
-            if iteration % 10 == 0 or last:
-                save(iteration)
-            if args.eval_every and (iteration % args.eval_every == 0 or last):
-                for name, value in evaluate(agent, args, args.eval_trials).items():
-                    writer.add_scalar(name, value, global_step)
-            if stopping:
-                raise KeyboardInterrupt
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        progress.close()
-        if args.final_trials:
-            for name, value in evaluate(agent, args, args.final_trials).items():
-                name = name.replace("eval/", "final/")
-                writer.add_scalar(name, value, num_iterations * batch_size)
-                print(f"{name}: {value:.3f}")
-    except KeyboardInterrupt:
-        save(completed)
-        progress.close()
-        print(f"interrupted; go on with --resume {run_dir}")
-        raise SystemExit(130) from None
+    if args.final_trials:
+        scores = evaluate("final", args.final_trials, num_iterations * batch_size)
+        print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
     writer.close()
-    envs.close()
     print(f"policy saved to {run_dir / 'policy.pt'}")
