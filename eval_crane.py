@@ -1,15 +1,13 @@
 """Judge a policy by the paper's Monte-Carlo protocol: log diameters 0.3 ... 0.8 m, 100 trials each.
 
     python eval_crane.py                              # the shipped mPPO policy, Tables I and II
-    python eval_crane.py runs/<run>/policy.pt         # any policy of this repository's scripts
-    python eval_crane.py --policy scripted            # without learning, see scripted_crane.py
-    python eval_crane.py --policy random --trials 20
+    python eval_crane.py runs/<run>                   # a policy of this repository's scripts
+    python eval_crane.py --policy scripted            # no learning, see scripted_crane.py
     python eval_crane.py --video lift.mp4             # or --viewer, in a window
 
-A trial succeeds as `grip_conditions` and `success_conditions` of crane_env.py say: log reached
-within 6 s, and through the last 0.5 s of 9 s lifted, held by both jaws, and gripped within 0.3 m of
-its centre. Trial k of a diameter and seed is always the same trial. Intervals are 95 % Wilson score
-intervals.
+A trial succeeds if the log is reached within 6 s, and is lifted, held by both jaws and gripped
+within 0.3 m of its centre throughout the last 0.5 s of 9 s. Trial k of a diameter and a seed is
+always the same trial. Intervals are 95 % Wilson score intervals.
 """
 
 import csv
@@ -18,10 +16,9 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import imageio
 import numpy as np
@@ -34,7 +31,7 @@ import mppo_beta_crane
 import ppo_crane
 import recurrent_ppo_crane
 import trpo_crane
-from crane_env import CraneVectorEnv, monte_carlo_trials
+from crane_env import CONDITIONS, DIAMETERS, make_envs, monte_carlo_trials, run_trials
 from scripted_crane import ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
@@ -44,28 +41,30 @@ PAPER = {  # % of 100 trials per diameter in m
     "none": {0.3: 94, 0.4: 96, 0.5: 98, 0.6: 98, 0.7: 96, 0.8: 96},  # Table I
     "step": {0.3: 88, 0.4: 94, 0.5: 93, 0.6: 93, 0.7: 92, 0.8: 91},  # Table II
 }
-CRANES = 600  # simulated at once
-Act = Callable[[np.ndarray], np.ndarray]  # observations (N, 18) to actions (N, 6)
+TITLES = {"none": "Table I, clean", "step": "Table II, pose noise", "episode": "Pose noise"}
+CRANES = 200  # simulated at once
 
 
 @dataclass
 class Args:
     path: Annotated[Path, tyro.conf.Positional] = SHIPPED
-    """policy.pt of a run"""
+    """a run's folder or a policy.pt"""
     policy: Literal["file", "scripted", "zero", "random"] = "file"
     """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions"""
+    env_id: str | None = None
+    """task to judge on; unset: the one the policy was trained on"""
+    contact: Literal["primitive", "sdf"] | None = None
+    """contact model of jaws and log; unset: the task's"""
     signed_yaw: bool = True
-    """scripted observes the signed angle to the log, not the paper's Delta_psi"""
+    """what --policy scripted observes: the signed angle to the log or the paper's Delta_psi"""
+    pose_noise: Literal["none", "step", "episode"] | None = None
+    """error of the observed log pose; unset: the table without and the one with `step`"""
     trials: int = 100
     """trials per log diameter"""
-    diameters: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+    diameters: tuple[float, ...] = DIAMETERS
     """log diameters [m]"""
     seed: int = 40_000
     """seed of the trials"""
-    contact: Literal["primitive", "sdf"] = "primitive"
-    """contact model of jaws and log"""
-    pose_noise: Literal["none", "step", "episode"] | None = None
-    """error of the observed log pose; unset: the table without and the one with `step`"""
     stochastic: bool = False
     """sample actions instead of taking the mean action"""
     env_threads: int = 0
@@ -75,117 +74,99 @@ class Args:
     json: bool = False
     """print one JSON object and nothing else (one table, noise none unless said)"""
     video: Path | None = None
-    """film one trial per diameter into this .mp4 or .gif instead of evaluating"""
+    """film one trial per diameter into this .mp4 or .gif instead of judging"""
     camera: Literal["overview", "side", "grapple"] = "overview"
     """of the video"""
     width: int = 1280
-    """of the video [pixels], 16:9, at most 1920"""
+    """of the video [pixels], 16:9, even, at most 1920"""
     viewer: bool = False
-    """show one trial after another in a window instead of evaluating"""
+    """show one trial after another in a window instead of judging"""
 
 
-def load_policy(path: Path, stochastic: bool) -> tuple[Callable[[], Act], dict, str]:
-    """Maker of an acting function with fresh memory, environment arguments, algorithm name."""
+def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
+    """The agent in a policy.pt, the task it was trained on, its algorithm. SystemExit if damaged.
+
+    The task is `env_id`, `revision` and all options of the environment.
+    """
     path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
         raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        algorithm = str(saved["algorithm"])
-        args = {"axes": "world"} | dict(saved["args"])  # as they were before one could choose
-        weights = saved["weights"]
-    except Exception:
+        algorithm, task = saved["algorithm"], dict(saved["task"])
+        weights, args = saved["weights"], dict(saved["args"])
+    except Exception:  # a damaged file raises many kinds
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
     if algorithm not in ALGORITHMS:
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
-    module = ALGORITHMS[algorithm]
-    known = {field.name for field in fields(module.Args)}
-    if saved.get("task") != crane_env.REVISION or not args.keys() <= known:
-        print(
-            f"{path} is of another revision of this repository; judged by today's", file=sys.stderr
-        )
+    if "frame_skip" not in task:
+        raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
+    if task["revision"] != crane_env.REVISION:
+        print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
+    script = ALGORITHMS[algorithm]
     try:
-        args = module.Args(**{key: value for key, value in args.items() if key in known})
-        on_crane = module.is_crane(args)
-        agent = module.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
-        if on_crane:
-            # policy.pt has no critic, and acting needs none
-            agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
-    except Exception as error:  # whatever a damaged file may raise
+        agent = script.Agent(18, np.full(6, -1.0), np.full(6, 1.0), script.Args(**args))
+        # policy.pt has no critic, and acting needs none
+        agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
+    except Exception as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
-        raise SystemExit(f"{path} does not fit a {algorithm} policy: {reason}") from None
-    if not on_crane:
-        raise SystemExit(f"{path} was trained on {args.env_id}, not on the crane")
-
-    def make_act() -> Act:
-        state = None
-
-        @torch.no_grad()
-        def act(obs: np.ndarray) -> np.ndarray:
-            nonlocal state
-            obs = torch.as_tensor(obs)
-            if not hasattr(agent, "initial_state"):
-                return agent.predict(obs, not stochastic).numpy()
-            state = agent.initial_state(len(obs)) if state is None else state
-            actions, state = agent.predict(obs, state, not stochastic)
-            return actions.numpy()
-
-        return act
-
-    return make_act, module.crane_kwargs(args), algorithm
+        raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
+    return agent, task, algorithm
 
 
-def fixed_policy(
-    kind: str, seed: int, signed_yaw: bool = True
-) -> tuple[Callable[[], Act], dict, str]:
-    """`load_policy` for policies without weights."""
+class FixedPolicy:
+    """Zero or uniformly random actions."""
 
-    if kind == "scripted":
-        return lambda: ScriptedCrane(signed_yaw), {"signed_yaw": signed_yaw}, kind
-    rng = np.random.default_rng(seed)
+    def __init__(self, kind: str, seed: int):
+        self.scale, self.rng = float(kind == "random"), np.random.default_rng(seed)
 
-    def make_act() -> Act:
-        if kind == "zero":
-            return lambda obs: np.zeros((len(obs), 6))
-        return lambda obs: rng.uniform(-1, 1, (len(obs), 6))
-
-    return make_act, {}, kind
+    def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True):
+        return self.scale * self.rng.uniform(-1, 1, (len(obs), 6)), None
 
 
-def run_trials(make_act: Callable[[], Act], kwargs: dict, diameters, seeds) -> list[dict]:
-    """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m)."""
-    records = []
-    chunks = [slice(i, i + CRANES) for i in range(0, len(seeds), CRANES)]
-    bar = tqdm(total=0, desc=f"{len(seeds)} trials", leave=False)
-    for chunk in chunks:
-        envs = CraneVectorEnv(len(seeds[chunk]), diameter=diameters[chunk], **kwargs)
-        obs, _ = envs.reset(seed=seeds[chunk])
-        act, results = make_act(), [None] * envs.num_envs
-        bar.total = len(chunks) * envs.max_decisions
-        for _ in range(envs.max_decisions):
-            obs, _, terminated, truncated, info = envs.advance(act(obs))
-            for i in np.flatnonzero(terminated | truncated):
-                if results[i] is None:  # the first end of this crane's trial
-                    results[i] = {key: value[i] for key, value in info.items()}
-            bar.update()
-        records += [trial_record(d, result) for d, result in zip(diameters[chunk], results)]
+def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The task's id and options to judge on, with a warning where it is not the policy's own."""
+    env_id = args.env_id or trained_on["env_id"]
+    names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "curriculum", "retry"}
+    options = {} if args.env_id else {name: trained_on[name] for name in names}
+    options |= {"contact": args.contact} if args.contact else {}
+    if args.policy == "scripted":
+        options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}
+    elif args.env_id and args.policy == "file":
+        envs = make_envs(env_id, 1, **options)
+        for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed"):
+            ours, theirs = envs.unwrapped.options[name], trained_on[name]
+            if ours != theirs:
+                print(f"the policy knows {name}={theirs!r}; {env_id} has {ours!r}", file=sys.stderr)
         envs.close()
-    bar.close()
+    return env_id, options
+
+
+def judge(policy: Any, env_id: str, options: dict, args: Args) -> list[dict]:
+    """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m)."""
+    diameters, seeds = monte_carlo_trials(args.seed, args.trials, args.diameters)
+    records = []
+    with tqdm(total=len(seeds), unit="trial", leave=False) as bar:
+        for start in range(0, len(seeds), CRANES):
+            chunk = slice(start, start + CRANES)
+            sizes = diameters[chunk]
+            envs = make_envs(env_id, len(sizes), args.env_threads, diameter=sizes, **options)
+            results = run_trials(policy, envs, seeds[chunk], not args.stochastic)
+            envs.close()
+            for i, diameter in enumerate(sizes):
+                end = {name: values[i].item() for name, values in results.items()}
+                records.append({"diameter": float(diameter), **trial_record(end)})
+            bar.update(len(sizes))
     return records
 
 
-def trial_record(diameter: float, info: dict) -> dict:
-    failure = str(info["termination"])
+def trial_record(end: dict) -> dict:
+    """What is reported of a trial's end. Its failure is the first rule or condition it broke."""
+    failure = end["termination"]
     if failure == "time_limit":
-        conditions = ["not_reached", "not_lifted", "not_held", "off_centre"]
-        failure = next((name for name in conditions if info[name]), "")
-    return {
-        "diameter": float(diameter),
-        "success": bool(info["success"]),
-        "failure": failure,
-        "time_to_reach": float(info["time_to_reach"]),
-        "centre_miss": float(info["centre_miss"]),
-    }
+        failure = next((name for name in CONDITIONS if end[name]), "")
+    kept = ("success", "time_to_reach", "centre_miss")
+    return {name: end[name] for name in kept} | {"failure": failure}
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -236,69 +217,69 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
     paper = "" if None in published else f"{np.mean(published):.1f}"
     print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
     print(
-        "Reach (first d_combine < 0.35 m) and miss (grip to log centre) are means of the successes."
+        "reach: first time with d_combine < 0.35 m; miss: from the grip to the log's centre, along"
     )
+    print("the log; both are means over the successes")
 
 
-def film(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
-    """One trial per diameter. At 10 decisions a second, a frame is also taken between decisions."""
-    skip = kwargs.get("frame_skip", 20)
-    substeps = 2 if skip % 20 == 0 else 1
-    frame_every = max(1, round(10 / (skip // substeps)))
-    dt = skip // substeps * crane_env.TIMESTEP
-    fps = round(1 / (frame_every * dt))
-    gif = args.video.suffix == ".gif"
-    options = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
+def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
+    """One trial per diameter, 20 frames a second. A frame is also taken halfway through a decision
+    of 0.1 s.
+    """
     size = {"width": args.width, "height": args.width * 9 // 32 * 2}
-    kwargs = kwargs | size | {"render_mode": "rgb_array", "camera": args.camera}
-    kwargs["frame_skip"] = skip // substeps
+    scene = options | size | {"render_mode": "rgb_array", "camera": args.camera}
+    skip = make_envs(env_id, 1, **options).unwrapped.frame_skip
+    substeps = 2 if skip % 20 == 0 else 1
+    scene["frame_skip"] = skip // substeps
+    frame_every = max(1, round(10 / scene["frame_skip"]))
+    fps = round(1 / (frame_every * scene["frame_skip"] * crane_env.TIMESTEP))
+    gif = args.video.suffix == ".gif"
+    how = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
+    frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
+    bar = tqdm(total=frames, unit="frame", leave=False)
     try:
-        frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where one ends early
-        bar = tqdm(total=frames, unit="frame", leave=False)
-        with bar, imageio.get_writer(unfinished, **options) as video:
+        with bar, imageio.get_writer(unfinished, **how) as video:
             for diameter, seed in zip(diameters, seeds):
-                envs = CraneVectorEnv(1, diameter=diameter, **kwargs)
-                obs, _ = envs.reset(seed=[seed])
-                act, ended, step = make_act(), False, 0
+                crane = make_envs(env_id, 1, diameter=diameter, **scene).unwrapped
+                obs, _ = crane.reset(seed=[seed])
+                state, ended, step = None, False, 0
                 while not ended:
                     if step % substeps == 0:
-                        actions = act(obs)
-                    obs, _, terminated, truncated, _ = envs.advance(actions)
+                        actions, state = policy.predict(obs, state, not args.stochastic)
+                    obs, _, terminated, truncated, _ = crane.advance(actions)
                     if step % frame_every == 0:
-                        video.append_data(envs.render()[0])
+                        video.append_data(crane.render()[0])
                         bar.update()
                     ended, step = terminated[0] or truncated[0], step + 1
-                envs.close()
+                crane.close()
         os.replace(unfinished, args.video)
     finally:
         unfinished.unlink(missing_ok=True)
     print(f"{len(seeds)} trials filmed in {args.video}")
 
 
-def show(make_act: Callable[[], Act], kwargs: dict, args: Args) -> None:
-    """Trials in a window, in real time, until it is closed; diameters are drawn."""
-    envs = CraneVectorEnv(1, render_mode="human", **kwargs)
-    try:
-        obs, _ = envs.reset(seed=args.seed)
-        act = make_act()
-        while envs.viewer is None or envs.viewer.is_running():
-            start = time.time()
-            obs, _, terminated, truncated, info = envs.step(act(obs))
-            envs.render()
-            if terminated[0] or truncated[0]:
-                print("success" if info["success"][0] else f"failed: {info['termination'][0]}")
-                act = make_act()
-            time.sleep(max(0.0, envs.dt - (time.time() - start)))
-    except KeyboardInterrupt:
-        pass
-    envs.close()
+def show(policy: Any, env_id: str, options: dict, args: Args) -> None:
+    """Trials in a window, in real time, until it is closed. Diameters are drawn."""
+    crane = make_envs(env_id, 1, render_mode="human", **options).unwrapped
+    obs, _ = crane.reset(seed=args.seed)
+    state = None
+    while crane.viewer.is_running():
+        start = time.time()
+        actions, state = policy.predict(obs, state, not args.stochastic)
+        obs, _, terminated, truncated, info = crane.step(actions)
+        if terminated[0] or truncated[0]:
+            print("success" if info["success"][0] else f"failed: {info['termination'][0]}")
+            state = None
+        time.sleep(max(0.0, crane.dt - (time.time() - start)))
+    crane.close()
 
 
-def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
+def check(args: Args) -> None:
+    """SystemExit that names a wrong argument and its mend."""
     low, high = crane_env.D_MIN, crane_env.D_MAX
+    from_file, wrong_use = args.policy == "file", "goes with --policy file only"
     for wrong, message in [
         (args.trials < 1, f"--trials must be at least 1, got {args.trials}"),
         (args.seed < 0, f"--seed must be at least 0, got {args.seed}"),
@@ -308,8 +289,8 @@ def main() -> None:
             not all(low <= d <= high for d in args.diameters),
             f"--diameters must lie in [{low}, {high}] m, got {args.diameters}",
         ),
-        (args.policy != "file" and args.path != SHIPPED, "PATH goes with --policy file only"),
-        (args.policy != "file" and args.stochastic, "--stochastic goes with --policy file only"),
+        (not from_file and args.path != SHIPPED, f"PATH {wrong_use}"),
+        (not from_file and args.stochastic, f"--stochastic {wrong_use}"),
         (
             args.policy != "scripted" and not args.signed_yaw,
             "--no-signed-yaw is for --policy scripted; a trained policy brings its own",
@@ -317,7 +298,7 @@ def main() -> None:
         (args.video and args.viewer, "either --video or --viewer"),
         (
             (args.video or args.viewer) and (args.json or args.csv),
-            "--video and --viewer judge nothing, so that --json and --csv have nothing to write",
+            "--video and --viewer judge nothing: --json and --csv have nothing to write",
         ),
         (
             args.video and args.video.suffix not in (".mp4", ".gif"),
@@ -334,52 +315,49 @@ def main() -> None:
     ]:
         if wrong:
             raise SystemExit(message)
-    for path in filter(None, (args.video, args.csv)):
-        if not path.parent.is_dir():
+    for path in (args.video, args.csv):
+        if path and not path.parent.is_dir():
             raise SystemExit(f"no folder {path.parent}; make it first")
-        if path.is_dir():
+        if path and path.is_dir():
             raise SystemExit(f"{path} is a folder; name a file")
+
+
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
+    check(args)
+    task = {"env_id": "ForestryCrane-v0"}
     if args.policy == "file":
-        make_act, kwargs, name = load_policy(args.path, args.stochastic)
+        policy, task, name = load_policy(args.path)
         source = str(args.path)
     else:
-        make_act, kwargs, name = fixed_policy(args.policy, args.seed, args.signed_yaw)
-        source = args.policy
-    torch.set_num_threads(1)  # small batches: more threads only wait for each other
-    kwargs |= {"contact": args.contact, "env_threads": args.env_threads}
+        policy = ScriptedCrane(args.signed_yaw)
+        if args.policy != "scripted":
+            policy = FixedPolicy(args.policy, args.seed)
+        name = source = args.policy
+    env_id, options = task_of(args, task)
+    torch.set_num_threads(1)  # the batches are too small for more
     if args.video or args.viewer:
         torch.manual_seed(args.seed)
-        kwargs["pose_noise"] = args.pose_noise or "none"
-        return (film if args.video else show)(make_act, kwargs, args)
+        options["pose_noise"] = args.pose_noise or "none"
+        return (film if args.video else show)(policy, env_id, options, args)
 
-    diameters, seeds = monte_carlo_trials(args.seed, args.trials, args.diameters)
-    noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
     all_records = []
+    noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
     for noise in noises:
         torch.manual_seed(args.seed)
-        records = run_trials(make_act, {**kwargs, "pose_noise": noise}, diameters, seeds)
+        options["pose_noise"] = noise
+        records = judge(policy, env_id, options, args)
         cells = summarize(records)
         all_records += [{"pose_noise": noise, **record} for record in records]
+        contact = crane_env.complete(options)["contact"]
         if args.json:
-            wins = sum(cell["successes"] for cell in cells)
-            result = {
-                "policy": source,
-                "contact": args.contact,
-                "pose_noise": noise,
-                "seed": args.seed,
-                "cells": cells,
-                "mean_success_rate": wins / len(records),
-            }
-            json.dump(result, sys.stdout)
-            print()
+            mean = sum(cell["successes"] for cell in cells) / len(records)
+            answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
+            answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
+            print(json.dumps(answer))
         else:
-            table = {"none": "Table I, clean", "step": "Table II, pose noise"}.get(
-                noise, "Pose noise"
-            )
-            what = (
-                f"{name} ({source}), {args.contact} contact, pose noise {noise}, seed {args.seed}"
-            )
-            print_table(records, cells, noise, f"{table}: {what}")
+            what = f"{name} ({source}), {contact} contact, pose noise {noise}, seed {args.seed}"
+            print_table(records, cells, noise, f"{TITLES[noise]}: {what}")
     if args.csv:
         with open(args.csv, "w", newline="") as file:
             writer = csv.DictWriter(file, all_records[0].keys())
@@ -388,4 +366,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        raise SystemExit("\ninterrupted") from None

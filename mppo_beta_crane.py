@@ -375,13 +375,12 @@ if __name__ == "__main__":
         # Reports
         now, global_step = time.time(), iteration * batch_size
         sps = batch_size / (now - rollout_start)
-        report = {"charts/updates": iteration}
+        report = {"charts/updates": iteration, "policy/perturbation": epsilon}
         report |= {name: np.mean(values) for name, values in stats.items()}
         report |= crane_env.rollout_report(envs, infos)
         report["losses/explained_variance"] = 1 - (b_advantages.var() / b_returns.var()).item()
         at_bounds = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
         report["policy/boundary_frac"] = at_bounds.float().mean().item()
-        report["policy/perturbation"] = epsilon
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
         report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * 20 * tenths}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}

@@ -236,9 +236,7 @@ if __name__ == "__main__":
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
     if args.num_envs % args.num_minibatches or batch_size < 2 * args.num_minibatches:
-        raise SystemExit(
-            "--num-envs must be a multiple of --num-minibatches, rollouts longer than 1"
-        )
+        raise SystemExit("--num-envs must be a multiple of --num-minibatches, --num-steps above 1")
 
     def to_tensor(x: np.ndarray) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float32, device=device)
@@ -342,11 +340,9 @@ if __name__ == "__main__":
             cut = truncated & ~terminated  # by the time limit: the task itself goes on
             if cut.any():
                 final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))[None]
-                no_starts = torch.zeros_like(final_obs[..., 0])
+                no_starts, cut_state = torch.zeros_like(final_obs[..., 0]), [h[cut] for h in state]
                 with torch.no_grad():
-                    features, _ = agent.remember(
-                        final_obs, (state[0][cut], state[1][cut]), no_starts
-                    )
+                    features, _ = agent.remember(final_obs, cut_state, no_starts)
                     rewards[step, cut] += gamma * agent.get_value(features[0])
 
         # Advantages

@@ -1,9 +1,8 @@
 """A scripted crane: resolved-rate control and four phases, the classical rival of the policies.
 
-It sees what a policy sees, the 18 numbers of the observation (with axes "world"), and learns
-nothing. It knows the
+It sees what a policy sees, the 18 numbers of the observation, and learns nothing. It knows the
 crane's lengths and speed limits (assets/README.md) and that Delta_p is 0 where the jaws' tips just
-clear the ground, whatever the log's diameter (offset "plus").
+clear the ground, whatever the log's diameter.
 
 Frames: K_i = K_{i-1} RotZ(q_i) Trans(a, 0, d) RotX(alpha). A column of the Jacobian is z x (p - o)
 for a joint that turns about the axis z through o, and z for a telescope stage. The passive joints
@@ -123,20 +122,28 @@ def bounded(vector: np.ndarray, length: float) -> np.ndarray:
 
 
 class ScriptedCrane:
-    """Maps observations (N, 18) to actions (N, 6). Its memory is that of one batch of trials."""
+    """Maps observations (N, 18) of ForestryCrane-v0 to actions (N, 6)."""
 
     def __init__(self, signed_yaw: bool = True):
         self.signed_yaw = signed_yaw
-        self.phase: np.ndarray | None = None  # (N,), begins with the first observation
 
-    def _start(self, cranes: int) -> None:
+    def predict(
+        self, obs: np.ndarray, state: "ScriptedCrane | None" = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, "ScriptedCrane"]:
+        """Actions (N, 6) and the memory of this batch of trials. None starts new trials."""
+        if state is None:
+            state = ScriptedCrane(self.signed_yaw)
+            state.start(len(obs))
+        return state.act(obs), state
+
+    def start(self, cranes: int) -> None:
         self.phase = np.full(cranes, APPROACH)
         self.velocity = np.zeros((cranes, 3))  # commanded last, m/s
         self.q7_goal = np.zeros(cranes)  # rad, over the log
         self.log_yaw = None  # (N, 2) rad, where the log may lie by the first observation
         self.doubt = np.zeros((cranes, 2))  # how badly either has predicted Delta_psi since
 
-    def _signed_angle(self, delta_psi: np.ndarray, grapple_axis: np.ndarray) -> np.ndarray:
+    def find_signed_angle(self, delta_psi: np.ndarray, grapple_axis: np.ndarray) -> np.ndarray:
         """Angle to the log (N,) in rad from Delta_psi (N,) = 1 - |cos|, which hides its sign.
 
         The first observation leaves two yaws for the log, and the rotator turns towards one of
@@ -152,17 +159,18 @@ class ScriptedCrane:
         better = predicted[np.arange(len(angle)), self.doubt.argmin(axis=-1)]
         return np.copysign(angle, better)
 
-    def __call__(self, obs: np.ndarray) -> np.ndarray:
+    def act(self, obs: np.ndarray) -> np.ndarray:
         obs = np.asarray(obs, dtype=np.float64)
-        q, q8, q8_speed, delta_p = obs[:, :8], obs[:, 7], obs[:, 13], obs[:, 14:17]
-        if self.phase is None:
-            self._start(len(obs))
+        q, q8, q8_speed = obs[:, :8], obs[:, 7], obs[:, 13]
+        # Delta_p comes along the crane's axes; this controller works along the world's
+        cos, sin, (ahead, left, up) = np.cos(q[:, 0]), np.sin(q[:, 0]), obs[:, 14:17].T
+        delta_p = np.stack([cos * ahead - sin * left, sin * ahead + cos * left, up], axis=-1)
         frames, plumb_frames = forward_kinematics(q), forward_kinematics(plumb(q))
         p_centre, p_plumb = grapple_centre(frames), grapple_centre(plumb_frames)
         swing = p_centre - p_plumb
         angle = obs[:, 17]
         if not self.signed_yaw:
-            angle = self._signed_angle(angle, frames[-1, :, :3, 0])
+            angle = self.find_signed_angle(angle, frames[-1, :, :3, 0])
 
         # The rotator turns against yaw, and against the slew to come. A log looks the same after
         # half a turn: keep to one goal, in the middle of the rotator's range.
