@@ -316,8 +316,8 @@ def reward_terms(
     d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
     `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s.
 
-    kind "paper" is Sec. III-A2 as printed. "staged" pays each term only once the one before it is
-    earned (docs/environment.md, errata).
+    kind "paper" is Sec. III-A2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
+    the log is gripped there, and r_balance while both jaws hold it (docs/environment.md says why).
     """
     r_distance = np.exp(-OMEGA2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -355,9 +355,8 @@ def termination_rule(
         np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1) > LOG_RANGE,
         ~reached & (time > REACH_TIME - 1e-9),
         time > TIME_LIMIT - 1e-9,
-        np.ones_like(reached),
     ]
-    return np.array([*TERMINATIONS, "none"])[np.argmax(rules, axis=0)]
+    return np.select(rules, TERMINATIONS, default="none")
 
 
 def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:

@@ -1,13 +1,20 @@
-"""Our scripts beside Stable-Baselines3 and sb3-contrib on two well-known tasks.
+"""Our scripts compared with Stable-Baselines3 (SB3) and sb3-contrib on two well-known tasks.
 
-The same steps, networks, batch, epochs, step size, gamma, lambda and bounds on both sides,
-observations normalised on both or on neither, rewards by the same constant; final policies judged
-by the mean action in 20 episodes of the same seeds. Appends to benchmark/compare_sb3.csv and skips
-the rows it finds there: remove those of other settings first. Prints mean and standard deviation
-over the seeds.
+Both sides have the same number of decisions, networks, batches, epochs, gamma, lambda and bounds.
+The learning rate starts at the same value and falls linearly to 0 on both sides, update by update.
+For TRPO this is the learning rate of the critic. Both sides normalize the observations, or neither
+does. Both multiply the reward by the same constant. Each final policy is judged by its mean action
+in 20 episodes, whose seeds are the same for all policies.
+
+Each finished run adds one row to benchmark/compare_sb3.csv or to the file of --results. Runs that
+have a row when the script starts are skipped. Remove the rows of other settings first: the file
+does not say which schedule a run had. Two processes can write to the same file side by side if
+their --seeds differ. At the end the script prints mean and standard deviation over the seeds.
 
     pip install -r benchmark/requirements.txt
     python benchmark/compare_sb3.py --help
+    python benchmark/compare_sb3.py --tasks Pendulum-v1 --algorithms ppo --seeds 1 2 3 \
+        --results pendulum.csv
 """
 
 import csv
@@ -16,15 +23,21 @@ import sys
 import tempfile
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
 
 import gymnasium
 import numpy as np
 import torch
 import tyro
 
-ROOT = Path(__file__).parent.parent
+import crane_env
+import eval_crane
+
 RESULTS = Path(__file__).parent / "compare_sb3.csv"
 COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_over_episodes"]
 EPISODES, EVAL_SEED = 20, 10_000
@@ -32,10 +45,11 @@ EPISODES, EVAL_SEED = 20, 10_000
 
 @dataclass(frozen=True)
 class Task:
-    """Close to rl-baselines3-zoo (Pendulum, without gSDE) and CleanRL (HalfCheetah).
+    """Settings close to those of rl-baselines3-zoo (Pendulum) and CleanRL (HalfCheetah).
 
-    Without CleanRL's annealing, value clipping and running reward normalisation; TRPO by
-    sb3-contrib's defaults but for the batch of its critic.
+    The zoo's gSDE is left out, and so are CleanRL's clipped value loss and its running reward
+    normalization. TRPO has the defaults of sb3-contrib, except the batch of its critic and the
+    falling learning rate.
     """
 
     steps: int  # whole rollouts
@@ -65,22 +79,20 @@ class Args:
     """ours; SB3 has no Beta policy: its PPO stands there"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """one run each"""
+    results: Path = RESULTS
+    """CSV file that gets a row from each run"""
 
 
-def judge(task: str, act) -> tuple[float, float]:
-    """Mean and standard deviation of the return over EPISODES; act maps obs (n,) to an action."""
-    env, returns = gymnasium.make(task), []
-    for k in range(EPISODES):
-        obs, _ = env.reset(seed=EVAL_SEED + k)
-        total, done = 0.0, False
-        while not done:
-            obs, reward, terminated, truncated, _ = env.step(act(obs))
-            total, done = total + reward, terminated or truncated
-        returns.append(total)
-    return float(np.mean(returns)), float(np.std(returns))
+def judge(task: str, policy: Any) -> tuple[float, float]:
+    """Mean and standard deviation of the return over EPISODES; policy.predict as in `run_trials`."""
+    envs = crane_env.make_envs(task, EPISODES)
+    returns = crane_env.run_trials(policy, envs, EVAL_SEED)["episodic_return"]
+    envs.close()
+    return float(returns.mean()), float(returns.std())
 
 
-def train_ours(task: str, algorithm: str, seed: int):
+def train_ours(task: str, algorithm: str, seed: int) -> Any:
+    """Our agent after its training."""
     t = TASKS[task]
     flags = {
         "env-id": task,
@@ -99,46 +111,47 @@ def train_ours(task: str, algorithm: str, seed: int):
         "final-trials": 0,
     }
     if algorithm == "trpo":
-        # sb3-contrib averages the KL divergence over the action's components, ours sums it
+        # sb3-contrib takes the mean of the KL divergence over the action's components, we the sum
         components = gymnasium.make(task).action_space.shape[0]
         flags |= {"max-kl": MAX_KL * components, "cg-damping": CG_DAMPING * components}
         flags |= {"cg-iterations": CG_ITERATIONS, "max-grad-norm": "inf"}
-        flags["fisher-samples"] = t.num_envs * t.num_steps  # all, as there
+        flags["fisher-samples"] = t.num_envs * t.num_steps  # the whole rollout, as sb3-contrib
     else:
         flags |= {"clip-coef": CLIP, "target-kl": None}
-    # no schedules but mPPO's fading perturbation; Gaussians as wide at the start as SB3's, the Beta
-    # begins at alpha = beta = 2
+    # The learning rate falls, and mPPO's perturbation too. All else stays as it is at the start.
+    # Our Gaussian begins as wide as SB3's, and the Beta with alpha = beta = 2.
     flags |= {"narrowing": 0.0, "horizon-growth": 1.0}
     flags["log-excess-init" if algorithm == "mppo_beta" else "log-std-init"] = 0.0
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
-    words += ["--no-anneal-lr", "--hidden-sizes", *map(str, HIDDEN)]
+    words += ["--hidden-sizes", *map(str, HIDDEN)]
     words += [] if t.normalize_obs else ["--no-normalize-obs"]
     with tempfile.TemporaryDirectory() as folder:
         script = str(ROOT / f"{algorithm}_crane.py")
         command = [sys.executable, script, *words]
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
         (path,) = Path(folder).glob("runs/*/policy.pt")
-        sys.path.insert(0, str(ROOT))
-        import eval_crane
-
         saved = torch.load(path, weights_only=True)
-        module = eval_crane.ALGORITHMS[algorithm]
-        env = gymnasium.make(task)
-        low, high = env.action_space.low, env.action_space.high
-        agent = module.Agent(
-            env.observation_space.shape[0], low, high, module.Args(**saved["args"])
-        )
-        # policy.pt has no critic, and acting needs none
-        agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **saved["weights"]})
-
-    @torch.no_grad()
-    def act(obs: np.ndarray) -> np.ndarray:
-        return agent.predict(torch.as_tensor(obs, dtype=torch.float32)[None])[0].numpy()
-
-    return act
+    script, env = eval_crane.ALGORITHMS[algorithm], gymnasium.make(task)
+    low, high = env.action_space.low, env.action_space.high
+    args = script.Args(**saved["args"])
+    agent = script.Agent(env.observation_space.shape[0], low, high, args)
+    # policy.pt has no critic, and acting needs none
+    agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **saved["weights"]})
+    return agent
 
 
-def train_sb3(task: str, algorithm: str, seed: int):
+class NormalizedPolicy:
+    """A model of SB3 that takes raw observations."""
+
+    def __init__(self, model: Any, envs: Any):
+        self.model, self.envs = model, envs
+
+    def predict(self, obs: np.ndarray, state: Any = None, deterministic: bool = True) -> tuple:
+        return self.model.predict(self.envs.normalize_obs(obs), state, deterministic=deterministic)
+
+
+def train_sb3(task: str, algorithm: str, seed: int) -> NormalizedPolicy:
+    """The policy of SB3 or sb3-contrib after its training."""
     from sb3_contrib import TRPO
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
@@ -154,7 +167,11 @@ def train_sb3(task: str, algorithm: str, seed: int):
         wrapper_kwargs={"func": lambda reward: reward * t.reward_scale},
     )
     envs = VecNormalize(envs, norm_obs=t.normalize_obs, norm_reward=False)
+    start = CRITIC_LEARNING_RATE if algorithm == "trpo" else t.learning_rate
+    # SB3 passes what is left of the training after the rollout, and we what is left before it.
+    rollout = t.num_envs * t.num_steps / t.steps
     common = dict(
+        learning_rate=lambda left: (left + rollout) * start,
         n_steps=t.num_steps,
         batch_size=t.minibatch_size,
         gamma=t.gamma,
@@ -165,46 +182,46 @@ def train_sb3(task: str, algorithm: str, seed: int):
     )
     if algorithm == "trpo":
         own = dict(cg_max_steps=CG_ITERATIONS, cg_damping=CG_DAMPING, target_kl=MAX_KL)
-        own |= dict(learning_rate=CRITIC_LEARNING_RATE, n_critic_updates=EPOCHS)
-        model = TRPO("MlpPolicy", envs, **own, **common)
+        model = TRPO("MlpPolicy", envs, n_critic_updates=EPOCHS, **own, **common)
     else:
-        own = dict(n_epochs=EPOCHS, clip_range=CLIP)
-        model = PPO("MlpPolicy", envs, learning_rate=t.learning_rate, **own, **common)
+        model = PPO("MlpPolicy", envs, n_epochs=EPOCHS, clip_range=CLIP, **common)
     model.learn(t.steps)
-
-    def act(obs: np.ndarray) -> np.ndarray:
-        return model.predict(envs.normalize_obs(obs), deterministic=True)[0]
-
-    return act
+    return NormalizedPolicy(model, envs)
 
 
-if __name__ == "__main__":
+def read(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    rows = list(csv.DictReader(open(RESULTS))) if RESULTS.exists() else []
-    done = {
-        (r["task"], r["algorithm"], r["library"], int(r["seed"]), int(r["steps"])) for r in rows
-    }
-    for task in args.tasks:
-        for seed in args.seeds:
-            for algorithm in args.algorithms:
-                for library, train in (("ours", train_ours), ("sb3", train_sb3)):
-                    if library == "sb3" and algorithm == "mppo_beta":
-                        continue
-                    if (task, algorithm, library, seed, TASKS[task].steps) in done:
-                        continue
-                    mean, std = judge(task, train(task, algorithm, seed))
-                    row = [task, algorithm, library, seed, TASKS[task].steps]
-                    row += [round(mean, 1), round(std, 1)]
-                    new = not RESULTS.exists()
-                    with open(RESULTS, "a", newline="") as file:
-                        writer = csv.writer(file)
-                        writer.writerows([COLUMNS, row] if new else [row])
-                    print(*row, flush=True)
+    if not args.results.parent.is_dir():
+        raise SystemExit(f"--results: no folder {args.results.parent}; make it first")
+    if not args.results.exists():
+        with open(args.results, "a", newline="") as file:
+            csv.writer(file).writerow(COLUMNS)
+    run_columns = ("task", "algorithm", "library", "seed", "steps")
+    done = {tuple(row[name] for name in run_columns) for row in read(args.results)}
+    for task, seed, algorithm in product(args.tasks, args.seeds, args.algorithms):
+        for library, train in (("ours", train_ours), ("sb3", train_sb3)):
+            run = (task, algorithm, library, str(seed), str(TASKS[task].steps))
+            if run in done or (library == "sb3" and algorithm == "mppo_beta"):
+                continue
+            mean, std = judge(task, train(task, algorithm, seed))
+            row = [*run, round(mean, 1), round(std, 1)]
+            with open(args.results, "a", newline="") as file:
+                csv.writer(file).writerow(row)  # one write: rows of two processes do not mix
+            print(*row, flush=True)
 
     results = defaultdict(list)
-    for row in csv.DictReader(open(RESULTS)):
+    for row in read(args.results):
         cell = row["task"], row["algorithm"], row["library"]
         results[cell].append(float(row["mean_return"]))
     for cell, returns in sorted(results.items()):
         spread = np.std(returns, ddof=1) if len(returns) > 1 else np.nan
         print(*cell, f"{np.mean(returns):.0f} +- {spread:.0f} over {len(returns)} seeds")
+
+
+if __name__ == "__main__":
+    main()
