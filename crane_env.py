@@ -75,7 +75,7 @@ from numpy.random import Generator, SeedSequence, default_rng
 HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 REVISION = 6  # of the task; raise it when a change makes trained policies worse
-TIMESTEP = 0.005  # s, one physics step (paper, Sec. IV)
+TIMESTEP = 0.005  # s, one physics step (paper, Sec. V)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
 SDF_INITPOINTS, SDF_ITERATIONS = 8, 5  # of each search for SDF contacts (assets/README.md)
 LOG_LENGTH = 2.75  # m
@@ -169,7 +169,8 @@ def complete(options: Options) -> Options:
             raise ValueError(f"the crane has no option {name!r}, only {', '.join(types)}")
         if name in RANGES:
             low, high = RANGES[name]
-            good, needed = low <= value <= high, f"lie in [{low}, {high}]"
+            number = isinstance(value, (int, float, np.number))
+            good, needed = number and low <= value <= high, f"lie in [{low}, {high}]"
         else:
             allowed = get_args(types[name]) or (False, True)
             good, needed = value in allowed, f"be one of {', '.join(map(repr, allowed))}"
@@ -285,7 +286,7 @@ def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array
 
 
 def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
-    """Pose measurement errors of Sec. IV-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
+    """Pose measurement errors of Sec. V-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
     decay = np.sum(delta_p**2, axis=-1, keepdims=True) / POSE_RANGE**2  # s(Delta_p)
     factor = 1 + epsilon * decay
     return delta_p * factor[:, :1], angle * factor[:, 1]
@@ -316,8 +317,8 @@ def reward_terms(
     d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
     `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s.
 
-    kind "paper" is Sec. III-A2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
-    the log is gripped there, and r_balance while both jaws hold it (docs/environment.md says why).
+    kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
+    the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
     """
     r_distance = np.exp(-OMEGA2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
@@ -609,7 +610,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         kind = self.options["reward"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
         terms = reward_terms(state, d_combine, clearance, miss, command, kind)
-        info |= dict(zip(TERMS, terms))
+        info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
         angle = signed_angle if self.options["signed_yaw"] else delta_psi
         if self.options["pose_noise"] != "none":
             now = np.minimum(self.decisions, self.noise.shape[1] - 1)

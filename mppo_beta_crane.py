@@ -1,6 +1,6 @@
 """mPPO: proximal policy optimization with a Beta policy and perturbed actions, on the crane.
 
-The paper's own algorithm (Vu et al., Sec. III-B). It differs from PPO in two points:
+The paper's own algorithm (Vu et al., Sec. IV-C). It differs from PPO in two points:
 
 - The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n.
   It gives no probability to actions outside the limits (Chou et al., 2017). Its mean action,
@@ -231,6 +231,7 @@ if __name__ == "__main__":
     if not action_space.is_bounded():
         raise SystemExit(f"{args.env_id} has unbounded actions, and a Beta needs bounds")
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
+    frame_skip = envs.unwrapped.frame_skip if is_crane else 1
     tenths = envs.unwrapped.dt / 0.1 if is_crane else 1.0  # of a second in a decision
 
     # Agent
@@ -382,7 +383,7 @@ if __name__ == "__main__":
         at_bounds = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
         report["policy/boundary_frac"] = at_bounds.float().mean().item()
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
-        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * 20 * tenths}
+        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * frame_skip}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         for name, value in report.items():
             writer.add_scalar(name, value, global_step)

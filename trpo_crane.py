@@ -1,6 +1,6 @@
 """TRPO: trust region policy optimization with a Gaussian policy, on the crane.
 
-The paper's second baseline (Vu et al., Sec. IV-B), after Schulman et al., 2015:
+The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 
 - The policy is a ~ N(mu(s), sigma^2) as in PPO. Its mean mu(s) is what an evaluation takes.
 - Each rollout allows one step s of the policy: the natural gradient's direction, as long as the
@@ -306,6 +306,7 @@ if __name__ == "__main__":
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
+    frame_skip = envs.unwrapped.frame_skip if is_crane else 1
     tenths = envs.unwrapped.dt / 0.1 if is_crane else 1.0  # of a second in a decision
 
     # Agent
@@ -456,7 +457,7 @@ if __name__ == "__main__":
         report |= crane_env.rollout_report(envs, infos)
         report["losses/explained_variance"] = 1 - (b_advantages.var() / b_returns.var()).item()
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
-        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * 20 * tenths}
+        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * frame_skip}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         for name, value in report.items():
             writer.add_scalar(name, value, global_step)
