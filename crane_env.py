@@ -411,6 +411,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             diameter = np.broadcast_to(d, num_envs)
         self.options = options = complete(options)
+        self.task = {"revision": REVISION, **options}  # what a trained policy knows of it
         self.num_envs, self.fixed_diameter = int(num_envs), diameter
         self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
         self.viewer = None  # the window, or the renderer of "rgb_array"

@@ -17,11 +17,9 @@ The rest is PPO (Schulman et al., 2017) with generalized advantage estimation:
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
 V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. The executed action follows the perturbed policy, but
 rho and the KL estimate use the unperturbed Beta: while eps > 0 the estimate exceeds the true KL.
-
 Along the run the policy narrows, the horizon grows, the step size falls (docs/mppo_beta.md).
 
-    python mppo_beta_crane.py                      # the crane: minutes on two cores
-    python mppo_beta_crane.py --resume runs/<run>  # continue a run that was stopped
+    python mppo_beta_crane.py  # the crane: minutes on two cores
     python mppo_beta_crane.py --env-id Pendulum-v1 --num-envs 8 --minibatch-size 64
 """
 
@@ -198,8 +196,8 @@ def load_checkpoint(args: Args) -> tuple[dict, Args]:
         raise SystemExit(f"--resume takes the folder of a run, and there is no {path}")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        assert checkpoint["algorithm"] == ALGORITHM
-        assert checkpoint["task"]["revision"] == crane_env.REVISION
+        revision = checkpoint["task"].get("revision", crane_env.REVISION)  # the crane's
+        assert (checkpoint["algorithm"], revision) == (ALGORITHM, crane_env.REVISION)
         machine = ("resume", "device", "torch_threads", "env_threads")
         return checkpoint, Args(**checkpoint["args"] | {k: getattr(args, k) for k in machine})
     except Exception:  # a damaged file raises many kinds
@@ -250,11 +248,10 @@ if __name__ == "__main__":
 
     # Files
     run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
-    run_dir = Path("runs", run_name.replace("/", "-")) if args.resume is None else args.resume
+    run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
-    options = envs.unwrapped.options if is_crane else {}
-    task = {"env_id": args.env_id, "revision": crane_env.REVISION, **options}
+    task = {"env_id": args.env_id, **getattr(envs.unwrapped, "task", {})}
 
     def save(iteration: int) -> None:
         """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
@@ -289,8 +286,7 @@ if __name__ == "__main__":
     # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
-    rewards = torch.zeros((args.num_steps, args.num_envs), device=device)
-    dones = torch.zeros((args.num_steps, args.num_envs), device=device)
+    rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
 
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     iterations = {"initial": first_iteration - 1, "total": num_iterations}
