@@ -2,9 +2,8 @@
 
 The paper's own algorithm (Vu et al., Sec. IV-C). It differs from PPO in two points:
 
-- The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n.
-  It gives no probability to actions outside the limits (Chou et al., 2017). Its mean action,
-  alpha / (alpha + beta), is what an evaluation takes.
+- The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n:
+  no action outside the limits (Chou et al., 2017). Its mean, alpha / (alpha + beta), is evaluated.
 - In training each sampled action is perturbed, Eq. (robust ppo): a_n <- clip(a_n + g, 0, 1) with
   g ~ U(-eps, eps). Here eps falls to 0 during the first half of the run.
 
@@ -20,7 +19,7 @@ rho and the KL estimate use the unperturbed Beta: while eps > 0 the estimate exc
 Along the run the policy narrows, the horizon grows, the step size falls (docs/mppo_beta.md).
 
     python mppo_beta_crane.py  # the crane: minutes on two cores
-    python mppo_beta_crane.py --env-id Pendulum-v1 --num-envs 8 --minibatch-size 64
+    python mppo_beta_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
 """
 
 import os
@@ -229,8 +228,8 @@ if __name__ == "__main__":
     if not action_space.is_bounded():
         raise SystemExit(f"{args.env_id} has unbounded actions, and a Beta needs bounds")
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
-    frame_skip = envs.unwrapped.frame_skip if is_crane else 1
-    tenths = envs.unwrapped.dt / 0.1 if is_crane else 1.0  # of a second in a decision
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
 
     # Agent
     torch.manual_seed(args.seed)
@@ -252,6 +251,7 @@ if __name__ == "__main__":
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
     task = {"env_id": args.env_id, **getattr(envs.unwrapped, "task", {})}
+    stop_signals: list[int] = []
 
     def save(iteration: int) -> None:
         """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
@@ -265,14 +265,26 @@ if __name__ == "__main__":
             torch.save(contents, run_dir / f"{name}.tmp")  # a kill leaves the old file whole
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
 
-    def evaluate(name: str, trials: int, global_step: int) -> dict[str, float]:
+    def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
         how = (args.env_id, trials, args.eval_seed, args.env_threads)
         scores = crane_env.evaluate(agent, *how, **args.env)
         for key, value in scores.items():
-            writer.add_scalar(f"{name}/{key}", value, global_step)
+            writer.add_scalar(f"{name}/{key}", value, iteration * batch_size)
         return scores
 
-    stop_signals: list[int] = []
+    def finish_update(iteration: int, report: dict[str, float]) -> None:
+        """Write the report. Save, evaluate or stop when it is time to."""
+        for key, value in report.items():
+            writer.add_scalar(key, value, iteration * batch_size)
+        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
+        last = iteration == num_iterations
+        if iteration % 10 == 0 or last or stop_signals:
+            save(iteration)
+        if args.eval_every and (iteration % args.eval_every == 0 or last):
+            evaluate("eval", args.eval_trials, iteration)
+        if stop_signals:
+            print(f"\nstopped after update {iteration}; go on with --resume {run_dir}")
+            raise SystemExit(128 + stop_signals[0])
 
     def stop_after_update(signum: int, frame: object) -> None:
         """Ctrl-C, kill or a closed terminal: finish the update. The second time: stop at once."""
@@ -287,7 +299,6 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     iterations = {"initial": first_iteration - 1, "total": num_iterations}
     progress = trange(first_iteration, num_iterations + 1, **iterations)
@@ -310,8 +321,7 @@ if __name__ == "__main__":
                 obs[step] = agent.normalize(next_obs)
                 action = agent.get_distribution(obs[step]).sample()
             actions[step] = perturb_actions(action, epsilon)
-            env_actions = agent.to_env(actions[step])
-            next_obs, reward, terminated, truncated, info = envs.step(env_actions)
+            next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
             next_obs = to_tensor(next_obs)
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = to_tensor(terminated | truncated)
@@ -370,7 +380,7 @@ if __name__ == "__main__":
             agent.actor[-1].bias += args.narrowing / num_iterations  # raises alpha and beta
 
         # Reports
-        now, global_step = time.time(), iteration * batch_size
+        now = time.time()
         sps = batch_size / (now - rollout_start)
         report = {"charts/updates": iteration, "policy/perturbation": epsilon}
         report |= {name: np.mean(values) for name, values in stats.items()}
@@ -379,22 +389,12 @@ if __name__ == "__main__":
         at_bounds = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
         report["policy/boundary_frac"] = at_bounds.float().mean().item()
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
-        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * frame_skip}
+        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
-        for name, value in report.items():
-            writer.add_scalar(name, value, global_step)
-        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
-        last = iteration == num_iterations
-        if iteration % 10 == 0 or last or stop_signals:
-            save(iteration)
-        if args.eval_every and (iteration % args.eval_every == 0 or last):
-            evaluate("eval", args.eval_trials, global_step)
-        if stop_signals:
-            print(f"\nstopped after update {iteration}; go on with --resume {run_dir}")
-            raise SystemExit(128 + stop_signals[0])
+        finish_update(iteration, report)
 
     if args.final_trials:
-        scores = evaluate("final", args.final_trials, num_iterations * batch_size)
+        scores = evaluate("final", args.final_trials, num_iterations)
         print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
     writer.close()
     print(f"policy saved to {run_dir / 'policy.pt'}")

@@ -21,7 +21,7 @@ V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
 Along the run the policy narrows, the horizon grows, the step size falls (docs/recurrent_ppo.md).
 
     python recurrent_ppo_crane.py  # the crane: minutes on two cores
-    python recurrent_ppo_crane.py --env-id Pendulum-v1 --num-envs 8
+    python recurrent_ppo_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9 --log-std-init 0
 """
 
 import os
@@ -247,8 +247,8 @@ if __name__ == "__main__":
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
-    frame_skip = envs.unwrapped.frame_skip if is_crane else 1
-    tenths = envs.unwrapped.dt / 0.1 if is_crane else 1.0  # of a second in a decision
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
 
     # Agent
     torch.manual_seed(args.seed)
@@ -270,6 +270,7 @@ if __name__ == "__main__":
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
     task = {"env_id": args.env_id, **getattr(envs.unwrapped, "task", {})}
+    stop_signals: list[int] = []
 
     def save(iteration: int) -> None:
         """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
@@ -283,14 +284,26 @@ if __name__ == "__main__":
             torch.save(contents, run_dir / f"{name}.tmp")  # a kill leaves the old file whole
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
 
-    def evaluate(name: str, trials: int, global_step: int) -> dict[str, float]:
+    def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
         how = (args.env_id, trials, args.eval_seed, args.env_threads)
         scores = crane_env.evaluate(agent, *how, **args.env)
         for key, value in scores.items():
-            writer.add_scalar(f"{name}/{key}", value, global_step)
+            writer.add_scalar(f"{name}/{key}", value, iteration * batch_size)
         return scores
 
-    stop_signals: list[int] = []
+    def finish_update(iteration: int, report: dict[str, float]) -> None:
+        """Write the report. Save, evaluate or stop when it is time to."""
+        for key, value in report.items():
+            writer.add_scalar(key, value, iteration * batch_size)
+        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
+        last = iteration == num_iterations
+        if iteration % 10 == 0 or last or stop_signals:
+            save(iteration)
+        if args.eval_every and (iteration % args.eval_every == 0 or last):
+            evaluate("eval", args.eval_trials, iteration)
+        if stop_signals:
+            print(f"\nstopped after update {iteration}; go on with --resume {run_dir}")
+            raise SystemExit(128 + stop_signals[0])
 
     def stop_after_update(signum: int, frame: object) -> None:
         """Ctrl-C, kill or a closed terminal: finish the update. The second time: stop at once."""
@@ -305,7 +318,6 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones, starts = torch.zeros((3, args.num_steps, args.num_envs), device=device)
-
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
     iterations = {"initial": first_iteration - 1, "total": num_iterations}
@@ -328,8 +340,7 @@ if __name__ == "__main__":
                 obs[step], starts[step] = agent.normalize(next_obs), next_start
                 features, state = agent.remember(obs[step][None], state, next_start[None])
                 actions[step] = agent.get_distribution(features[0]).sample()
-            env_actions = agent.to_env(actions[step])
-            next_obs, reward, terminated, truncated, info = envs.step(env_actions)
+            next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
             next_obs = to_tensor(next_obs)
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = next_start = to_tensor(terminated | truncated)
@@ -394,29 +405,19 @@ if __name__ == "__main__":
             agent.log_std -= args.narrowing / num_iterations
 
         # Reports
-        now, global_step = time.time(), iteration * batch_size
+        now = time.time()
         sps = batch_size / (now - rollout_start)
         report = {"charts/updates": iteration}
         report |= {name: np.mean(values) for name, values in stats.items()}
         report |= crane_env.rollout_report(envs, infos)
         report["losses/explained_variance"] = 1 - (advantages.var() / returns.var()).item()
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
-        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * frame_skip}
+        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
-        for name, value in report.items():
-            writer.add_scalar(name, value, global_step)
-        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
-        last = iteration == num_iterations
-        if iteration % 10 == 0 or last or stop_signals:
-            save(iteration)
-        if args.eval_every and (iteration % args.eval_every == 0 or last):
-            evaluate("eval", args.eval_trials, global_step)
-        if stop_signals:
-            print(f"\nstopped after update {iteration}; go on with --resume {run_dir}")
-            raise SystemExit(128 + stop_signals[0])
+        finish_update(iteration, report)
 
     if args.final_trials:
-        scores = evaluate("final", args.final_trials, num_iterations * batch_size)
+        scores = evaluate("final", args.final_trials, num_iterations)
         print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
     writer.close()
     print(f"policy saved to {run_dir / 'policy.pt'}")
