@@ -217,9 +217,9 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
     paper = "" if None in published else f"{np.mean(published):.1f}"
     print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
     print(
-        "reach: first time with d_combine < 0.35 m; miss: from the grip to the log's centre, along"
+        "Reach is the mean time until d_combine < 0.35 m. Miss is the mean distance from the grip"
     )
-    print("the log; both are means over the successes")
+    print("to the log's centre, along the log. Both are means over the successes.")
 
 
 def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
