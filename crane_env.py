@@ -143,7 +143,7 @@ class Options(TypedDict, total=False):
     axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
     pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
     difficulty: float  # 0: easy starts, 1: the full task (1.0)
-    curriculum: bool  # raise the difficulty from 0 to 1 with the success rate (False)
+    curriculum: bool  # start at difficulty 0 and raise it with the success rate (False)
     retry: float  # share of episodes that start as a recent failure of that crane did (0.0)
     integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
     solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
@@ -169,12 +169,15 @@ def complete(options: Options) -> Options:
             raise ValueError(f"the crane has no option {name!r}, only {', '.join(types)}")
         if name in RANGES:
             low, high = RANGES[name]
-            number = isinstance(value, (int, float, np.number))
-            good, needed = number and low <= value <= high, f"lie in [{low}, {high}]"
+            whole = types[name] is int
+            kind = (int, np.integer) if whole else (int, float, np.number)
+            good = isinstance(value, kind) and low <= value <= high
+            needed = f"be a {'whole number' if whole else 'number'} in [{low}, {high}]"
         else:
             allowed = get_args(types[name]) or (False, True)
-            good, needed = value in allowed, f"be one of {', '.join(map(repr, allowed))}"
-        if not good or (types[name] is int and value != int(value)):
+            good = value in allowed
+            needed = f"be one of {', '.join(map(repr, allowed))}"
+        if not good:
             raise ValueError(f"{name} must {needed}, got {value!r}")
     return {**DEFAULTS, **options}
 
@@ -727,7 +730,8 @@ def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[
         report["charts/episodic_return"] = np.mean([info["episode"]["r"][i] for info, i in ends])
         report["charts/episodic_length"] = np.mean([info["episode"]["l"][i] for info, i in ends])
     if isinstance(crane, CraneVectorEnv):
-        report["charts/success_rate"] = np.mean(crane.recent_success or [0.0])
+        if crane.recent_success:
+            report["charts/success_rate"] = np.mean(crane.recent_success)
         report["charts/difficulty"] = crane.difficulty
         report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
         endings = [info["termination"][i] for info, i in ends]
@@ -755,6 +759,7 @@ def run_trials(
     policy.predict(obs (N, obs_dim), state, deterministic=...) gives actions (N, act_dim) and the
     next state. The first state is None. Stable-Baselines3's models have this method too.
     """
+    names = RESULTS if isinstance(envs.unwrapped, CraneVectorEnv) else {"episodic_return"}
     obs, _ = envs.reset(seed=seeds)
     results, state, ended = {}, None, np.zeros(envs.num_envs, bool)
     while not ended.all():
@@ -763,7 +768,7 @@ def run_trials(
         first = (terminated | truncated) & ~ended  # later ends are of episodes after the trial
         if first.any():
             info["episodic_return"] = info["episode"]["r"]
-            for name in info.keys() & RESULTS:
+            for name in names:
                 results.setdefault(name, np.zeros_like(info[name]))[first] = info[name][first]
         ended |= first
     return results
@@ -772,17 +777,21 @@ def run_trials(
 def evaluate(
     policy: Any, env_id: str, trials: int, seed: int, env_threads: int = 0, **options: Any
 ) -> dict[str, float]:
-    """Mean return and success rates in trials per diameter (other tasks: trials in all)."""
-    if is_crane(env_id):
+    """Mean return and success rates in trials per diameter (other tasks: trials in all).
+
+    The crane's difficulty, curriculum and retry do not count: these are trials of the full task.
+    """
+    crane = is_crane(env_id)
+    if crane:
         diameters, seeds = monte_carlo_trials(seed, trials)
         options |= {"diameter": diameters, "retry": 0.0, "curriculum": False, "difficulty": 1.0}
         envs = make_envs(env_id, len(seeds), env_threads, **options)
     else:
-        envs, seeds = make_envs(env_id, trials), seed
+        envs, seeds = make_envs(env_id, trials, **options), seed
     results = run_trials(policy, envs, seeds)
     envs.close()
     scores = {"episodic_return": results["episodic_return"].mean()}
-    if "success" in results:
+    if crane:
         scores["success_rate"] = results["success"].mean()
         for d in DIAMETERS:
             scores[f"success_rate_{d}m"] = results["success"][diameters == d].mean()

@@ -127,6 +127,12 @@ class FixedPolicy:
 def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """The task's id and options to judge on, with a warning where it is not the policy's own."""
     env_id = args.env_id or trained_on["env_id"]
+    try:
+        on_crane = crane_env.is_crane(env_id)
+    except Exception as error:  # an unknown id or module raises many kinds
+        raise SystemExit(f"--env-id {env_id}: {error}") from None
+    if not on_crane:
+        raise SystemExit(f"--env-id {env_id} is not the crane")
     names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "curriculum", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
     options |= {"contact": args.contact} if args.contact else {}
@@ -216,10 +222,8 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
     published = [PAPER.get(noise, {}).get(cell["diameter"]) for cell in cells]
     paper = "" if None in published else f"{np.mean(published):.1f}"
     print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
-    print(
-        "Reach is the mean time until d_combine < 0.35 m. Miss is the mean distance from the grip"
-    )
-    print("to the log's centre, along the log. Both are means over the successes.")
+    print("Reach is the mean time until d_combine < 0.35 m. Miss is the mean distance from grip to")
+    print("log centre, along the log. Both are means over the successes.")
 
 
 def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
@@ -238,7 +242,7 @@ def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     unfinished = args.video.with_name(f"unfinished_{args.video.name}")
     frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
-    bar = tqdm(total=frames, unit="frame", leave=False)
+    bar, mean = tqdm(total=frames, unit="frame", leave=False), not args.stochastic
     try:
         with bar, imageio.get_writer(unfinished, **how) as video:
             for diameter, seed in zip(diameters, seeds):
@@ -247,7 +251,7 @@ def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
                 state, ended, step = None, False, 0
                 while not ended:
                     if step % substeps == 0:
-                        actions, state = policy.predict(obs, state, not args.stochastic)
+                        actions, state = policy.predict(obs, state, deterministic=mean)
                     obs, _, terminated, truncated, _ = crane.advance(actions)
                     if step % frame_every == 0:
                         video.append_data(crane.render()[0])
@@ -267,7 +271,7 @@ def show(policy: Any, env_id: str, options: dict, args: Args) -> None:
     state = None
     while crane.viewer.is_running():
         start = time.time()
-        actions, state = policy.predict(obs, state, not args.stochastic)
+        actions, state = policy.predict(obs, state, deterministic=not args.stochastic)
         obs, _, terminated, truncated, info = crane.step(actions)
         if terminated[0] or truncated[0]:
             print("success" if info["success"][0] else f"failed: {info['termination'][0]}")

@@ -49,7 +49,7 @@ import tyro
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
-from tqdm import trange
+from tqdm import tqdm
 
 import crane_env
 
@@ -269,17 +269,17 @@ def compute_gae(
 
 def load_checkpoint(args: Args) -> tuple[dict, Args]:
     """checkpoint.pt of the run to resume and the run's arguments, except those of the machine."""
-    path = args.resume / "checkpoint.pt"
-    if not path.is_file():
-        raise SystemExit(f"--resume takes the folder of a run, and there is no {path}")
     try:
+        path = args.resume / "checkpoint.pt"
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        revision = checkpoint["task"].get("revision", crane_env.REVISION)  # the crane's
-        assert (checkpoint["algorithm"], revision) == (ALGORITHM, crane_env.REVISION)
+        revision = checkpoint["task"].get("revision", crane_env.REVISION)  # only the crane has one
+        if (checkpoint["algorithm"], revision) != (ALGORITHM, crane_env.REVISION):
+            raise ValueError(f"it is of {checkpoint['algorithm']}, task revision {revision}")
         machine = ("resume", "device", "torch_threads", "env_threads")
         return checkpoint, Args(**checkpoint["args"] | {k: getattr(args, k) for k in machine})
-    except Exception:  # a damaged file raises many kinds
-        raise SystemExit(f"--resume: {path} is damaged or of another script or task") from None
+    except Exception as error:  # a damaged file raises many kinds
+        reason = str(error).partition("\n")[0]
+        raise SystemExit(f"--resume: no usable checkpoint.pt in {args.resume}: {reason}") from None
 
 
 if __name__ == "__main__":
@@ -290,6 +290,9 @@ if __name__ == "__main__":
     if args.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda: torch finds no GPU; use --device cpu")
     device = torch.device(args.device)
+    sizes = (args.num_envs, args.num_steps, args.minibatch_size, args.eval_trials)
+    if min(sizes) < 1 or min(args.seed, args.eval_seed) < 0:
+        raise SystemExit("sizes and --eval-trials must be at least 1, seeds at least 0")
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
     if batch_size < 2 or not 0 < args.line_search_decay < 1:
@@ -312,8 +315,8 @@ if __name__ == "__main__":
     torch.manual_seed(args.seed)
     torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
-    critic = agent.critic.parameters()
-    optimizer = torch.optim.Adam(critic, lr=args.learning_rate, eps=1e-5, fused=True)
+    weights = agent.critic.parameters()
+    optimizer = torch.optim.Adam(weights, lr=args.learning_rate, eps=1e-5, fused=True)
     first_iteration = 1 if checkpoint is None else checkpoint["iteration"] + 1
     env_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
     if checkpoint is not None:
@@ -328,15 +331,16 @@ if __name__ == "__main__":
     run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
-    task = {"env_id": args.env_id, **getattr(envs.unwrapped, "task", {})}
+    task = {"env_id": args.env_id, **(envs.unwrapped.task if is_crane else {})}
     stop_signals: list[int] = []
 
     def save(iteration: int) -> None:
         """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
+        writer.flush()
         weights = agent.state_dict()
-        actor = {name: w for name, w in weights.items() if not name.startswith("critic.")}
+        acting = {name: w for name, w in weights.items() if not name.startswith("critic.")}
         policy = {"algorithm": ALGORITHM, "task": task, "args": asdict(args) | {"resume": None}}
-        policy |= {"weights": actor, "global_step": iteration * batch_size}  # acts without a critic
+        policy |= {"weights": acting, "global_step": iteration * batch_size}
         state = {"weights": weights, "optimizer": optimizer.state_dict(), "iteration": iteration}
         state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0
         for name, contents in (("policy", policy), ("checkpoint", policy | state)):
@@ -344,30 +348,32 @@ if __name__ == "__main__":
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
 
     def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
-        how = (args.env_id, trials, args.eval_seed, args.env_threads)
-        scores = crane_env.evaluate(agent, *how, **args.env)
+        protocol = {"trials": trials, "seed": args.eval_seed, "env_threads": args.env_threads}
+        scores = crane_env.evaluate(agent, args.env_id, **protocol, **args.env)
         for key, value in scores.items():
             writer.add_scalar(f"{name}/{key}", value, iteration * batch_size)
         return scores
 
     def finish_update(iteration: int, report: dict[str, float]) -> None:
-        """Write the report. Save, evaluate or stop when it is time to."""
+        """Write the report. Evaluate and save when it is time to, and stop if a signal came."""
         for key, value in report.items():
             writer.add_scalar(key, value, iteration * batch_size)
-        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
         last = iteration == num_iterations
-        if iteration % 10 == 0 or last or stop_signals:
-            save(iteration)
         if args.eval_every and (iteration % args.eval_every == 0 or last):
             evaluate("eval", args.eval_trials, iteration)
-        if stop_signals:
-            print(f"\nstopped after update {iteration}; go on with --resume {run_dir}")
+        stopping = bool(stop_signals)
+        if iteration % 10 == 0 or last or stopping:
+            save(iteration)
+        if stopping:
+            progress.close()
+            print(f"stopped after update {iteration}; go on with --resume {run_dir}")
             raise SystemExit(128 + stop_signals[0])
+        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
     def stop_after_update(signum: int, frame: object) -> None:
-        """Ctrl-C, kill or a closed terminal: finish the update. The second time: stop at once."""
+        """Ctrl-C, kill or a closed terminal: finish the update. A second Ctrl-C: stop at once."""
         stop_signals.append(signum)
-        signal.signal(signum, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     for signum in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:
         if signal.getsignal(signum) != signal.SIG_IGN:  # nohup ignores some
@@ -378,13 +384,13 @@ if __name__ == "__main__":
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
-    iterations = {"initial": first_iteration - 1, "total": num_iterations}
-    progress = trange(first_iteration, num_iterations + 1, **iterations)
+    remaining = range(first_iteration, num_iterations + 1)
+    progress = tqdm(remaining, initial=first_iteration - 1, total=num_iterations)
     for iteration in progress:
         # Schedules
         left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
-        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)
+        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # after a quarter of the run
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
 
@@ -450,10 +456,10 @@ if __name__ == "__main__":
                 value_loss = ((agent.get_value(b_obs[mb]) - b_returns[mb]) ** 2).mean()
                 optimizer.zero_grad()
                 value_loss.backward()
-                norm = nn.utils.clip_grad_norm_(agent.critic.parameters(), args.max_grad_norm)
+                grad_norm = nn.utils.clip_grad_norm_(agent.critic.parameters(), args.max_grad_norm)
                 optimizer.step()
                 stats["losses/value_loss"].append(value_loss.item())
-                stats["losses/grad_norm"].append(norm.item())
+                stats["losses/grad_norm"].append(grad_norm.item())
         with torch.no_grad():
             agent.log_std -= args.narrowing / num_iterations
 
@@ -469,6 +475,7 @@ if __name__ == "__main__":
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         finish_update(iteration, report)
 
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is saved
     if args.final_trials:
         scores = evaluate("final", args.final_trials, num_iterations)
         print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
