@@ -9,14 +9,7 @@ A policy with a memory can infer both:
 - A minibatch holds the whole rollouts of some of the cranes. Each of these sequences starts from
   the state that its crane had when the rollout began.
 
-With generalized advantage estimation:
-
-    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)         A_t = delta_t + gamma lambda A_{t+1}
-    rho     = pi(a | s) / pi_old(a | s)               R   = A + V_old
-    L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
-
-Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
-V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
+Advantages A, returns R, the loss and what the time limit does are those of ppo_crane.py.
 
 Along the run the policy narrows, the horizon grows, the step size falls (docs/recurrent_ppo.md).
 

@@ -15,13 +15,7 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
   larger E[rho A]. If none qualifies, the policy stays.
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
-With generalized advantage estimation:
-
-    delta_t = r_t + gamma V(s_{t+1}) - V(s_t)         A_t = delta_t + gamma lambda A_{t+1}
-    rho     = pi(a | s) / pi_old(a | s)               R   = A + V_old
-
-Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
-V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
+Advantages A, returns R and what the time limit does are those of ppo_crane.py.
 
 Along the run the policy narrows, the horizon grows, the critic's step size falls (docs/trpo.md).
 
