@@ -339,6 +339,7 @@ def main() -> None:
             policy = FixedPolicy(args.policy, args.seed)
         name = source = args.policy
     env_id, options = task_of(args, task)
+    contact = make_envs(env_id, 1, **options).unwrapped.options["contact"]
     torch.set_num_threads(1)  # the batches are too small for more
     if args.video or args.viewer:
         torch.manual_seed(args.seed)
@@ -353,7 +354,6 @@ def main() -> None:
         records = judge(policy, env_id, options, args)
         cells = summarize(records)
         all_records += [{"pose_noise": noise, **record} for record in records]
-        contact = crane_env.complete(options)["contact"]
         if args.json:
             mean = sum(cell["successes"] for cell in cells) / len(records)
             answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}

@@ -27,8 +27,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import gymnasium
 import numpy as np
@@ -38,6 +37,7 @@ import tyro
 import crane_env
 import eval_crane
 
+ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "compare_sb3.csv"
 COLUMNS = ["task", "algorithm", "library", "seed", "steps", "mean_return", "std_over_episodes"]
 EPISODES, EVAL_SEED = 20, 10_000
@@ -76,7 +76,7 @@ class Args:
     tasks: tuple[Literal[*TASKS], ...] = tuple(TASKS)
     """Gymnasium tasks"""
     algorithms: tuple[Literal["ppo", "mppo_beta", "trpo"], ...] = ("ppo", "mppo_beta", "trpo")
-    """ours; SB3 has no Beta policy: its PPO stands there"""
+    """our scripts; SB3 has no Beta policy, and its PPO is the one to compare mppo_beta with"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """one run each"""
     results: Path = RESULTS
@@ -84,7 +84,7 @@ class Args:
 
 
 def judge(task: str, policy: Any) -> tuple[float, float]:
-    """Mean and standard deviation of the return over EPISODES; policy.predict as in `run_trials`."""
+    """Mean and standard deviation of the return over EPISODES of a policy for `run_trials`."""
     envs = crane_env.make_envs(task, EPISODES)
     returns = crane_env.run_trials(policy, envs, EVAL_SEED)["episodic_return"]
     envs.close()
@@ -158,7 +158,6 @@ def train_sb3(task: str, algorithm: str, seed: int) -> NormalizedPolicy:
     from stable_baselines3.common.vec_env import VecNormalize
 
     t = TASKS[task]
-    torch.set_num_threads(1)
     envs = make_vec_env(
         task,
         t.num_envs,
@@ -168,7 +167,8 @@ def train_sb3(task: str, algorithm: str, seed: int) -> NormalizedPolicy:
     )
     envs = VecNormalize(envs, norm_obs=t.normalize_obs, norm_reward=False)
     start = CRITIC_LEARNING_RATE if algorithm == "trpo" else t.learning_rate
-    # SB3 passes what is left of the training after the rollout, and we what is left before it.
+    # SB3 passes the share of the run that is left after the rollout. Our scripts use the share that
+    # was left before it.
     rollout = t.num_envs * t.num_steps / t.steps
     common = dict(
         learning_rate=lambda left: (left + rollout) * start,
@@ -198,9 +198,12 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     if not args.results.parent.is_dir():
         raise SystemExit(f"--results: no folder {args.results.parent}; make it first")
-    if not args.results.exists():
-        with open(args.results, "a", newline="") as file:
+    torch.set_num_threads(1)
+    try:
+        with open(args.results, "x", newline="") as file:
             csv.writer(file).writerow(COLUMNS)
+    except FileExistsError:
+        pass
     run_columns = ("task", "algorithm", "library", "seed", "steps")
     done = {tuple(row[name] for name in run_columns) for row in read(args.results)}
     for task, seed, algorithm in product(args.tasks, args.seeds, args.algorithms):

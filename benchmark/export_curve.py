@@ -27,9 +27,9 @@ COLUMNS = {
 
 
 def export(run_dir: Positional[Path], csv_path: Positional[Path]) -> None:
-    """Rows by decision count; wall_time_s counts from the end of the first update."""
+    """One row per number of decisions. wall_time_s counts from the end of the first update."""
     if not run_dir.is_dir():
-        raise SystemExit(f"{run_dir} is no run's folder")
+        raise SystemExit(f"{run_dir} is not the folder of a run")
     events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
     events.Reload()
     rows: dict[int, dict] = {}

@@ -1,13 +1,15 @@
-"""Make the training runs behind the figures: two at a time with one thread each, or one (timed).
+"""Make the training runs behind the figures.
 
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
     python benchmark/make_runs.py timed       # mPPO, three seeds, one at a time; half an hour
     python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of all but the ablations
 
-Run it again to go on: what has a CSV in benchmark/curves/, ablations/ or timed/ is done, what was
-interrupted resumes from its checkpoint in benchmark/runs/. To make a run again, delete both; after
-a change of the task or of a default, all of benchmark/runs/.
+Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
+
+Run the script again to go on. It skips each run that has a CSV file in benchmark/curves/,
+ablations/ or timed/. It resumes an interrupted run from its checkpoint in benchmark/runs/. To make
+a run again, delete both. After a change of the task or of a default, delete all of benchmark/runs/.
 """
 
 import csv
@@ -28,33 +30,33 @@ HERE = Path(__file__).parent
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
-# Name: script and flags. At other decision rates as many simulation steps, updates and minibatches.
+# Script and flags by name. At another decision rate the number of simulation steps, updates and
+# minibatches stays the same. Commit c228fe1 is the last one with the flags of perturb_rpo and
+# no_bootstrap. Their CSV files stay.
 ABLATIONS = {
-    "default": ("mppo_beta_crane", []),
-    "reward_paper": ("mppo_beta_crane", ["--reward", "paper"]),
-    "perturb_none": ("mppo_beta_crane", ["--perturb", "none"]),
-    "perturb_rpo": ("mppo_beta_crane", ["--perturb", "rpo"]),
-    # the counterpart of perturb_none: the same step size, as wide at the start and at the end
-    "gaussian": ("ppo_crane", ["--learning-rate", "1e-3", "--narrowing", "0.83"]),
-    "offset_minus": ("mppo_beta_crane", ["--offset", "minus"]),
-    "unsigned_yaw": ("mppo_beta_crane", ["--no-signed-yaw"]),
-    "axes_world": ("mppo_beta_crane", ["--axes", "world"]),
-    "curriculum": ("mppo_beta_crane", ["--curriculum"]),
-    "retry_none": ("mppo_beta_crane", ["--retry", "0"]),
-    "no_bootstrap": ("mppo_beta_crane", ["--no-bootstrap"]),
+    "default": ("mppo_beta_crane", ""),
+    "reward_paper": ("mppo_beta_crane", "--env.reward paper"),
+    "perturb_none": ("mppo_beta_crane", "--perturbation 0"),
+    # to compare with perturb_none: the same learning rate, as wide at the start and at the end
+    "gaussian": ("ppo_crane", "--learning-rate 1e-3 --narrowing 0.83"),
+    "offset_minus": ("mppo_beta_crane", "--env.offset minus"),
+    "unsigned_yaw": ("mppo_beta_crane", "--env.no-signed-yaw"),
+    "axes_world": ("mppo_beta_crane", "--env.axes world"),
+    "curriculum": ("mppo_beta_crane", "--env.curriculum"),
+    "retry_none": ("mppo_beta_crane", "--env.retry 0"),
     "frame_skip_10": (
         "mppo_beta_crane",
-        "--frame-skip 10 --num-steps 128 --minibatch-size 2048 --total-timesteps 1228800".split(),
+        "--env.frame-skip 10 --num-steps 128 --minibatch-size 2048 --total-timesteps 1228800",
     ),
     "frame_skip_4": (
         "mppo_beta_crane",
-        "--frame-skip 4 --num-steps 320 --minibatch-size 5120 --total-timesteps 3072000".split(),
+        "--env.frame-skip 4 --num-steps 320 --minibatch-size 5120 --total-timesteps 3072000",
     ),
 }
 
 
 def make(folder: str, script: str, name: str, seed: int, flags: list[str], threads: int) -> str:
-    """Train (or go on) and export; what happened, in a line."""
+    """Train or resume a run and export its curve. Returns a line that says what happened."""
     csv_path = HERE / folder / f"{name}_seed{seed}.csv"
     command = [sys.executable, str(HERE.parent / f"{script}.py")]
     command += ["--torch-threads", str(threads), "--env-threads", str(threads)]
@@ -76,10 +78,10 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
 
 
 def evaluate() -> None:
-    """Success [%] of all finished runs that are there, by diameter, into evaluations.csv."""
+    """Write the success [%] of all finished runs in benchmark/runs by diameter: evaluations.csv."""
     path, rows = HERE / "evaluations.csv", {}
     if path.exists():
-        with open(path) as file:  # runs that are not there keep their rows
+        with open(path) as file:  # runs that are not in benchmark/runs keep their rows
             rows = {tuple(row.values())[:3]: row for row in csv.DictReader(file)}
     policies = []
     for folder, script in [*(("curves", name) for name in SCRIPTS), ("timed", SCRIPTS[0])]:
@@ -89,7 +91,7 @@ def evaluate() -> None:
                 policies.append((f"{folder}_{script}", seed, policy))
     if not policies:
         sys.exit(
-            "benchmark/runs has no policies: delete CSVs of curves/ and timed/ and make those runs"
+            "benchmark/runs has no policies: delete CSVs of curves/ or timed/ and make those runs"
         )
     for name, seed, policy in tqdm(policies):
         for noise in ("none", "step"):
@@ -117,7 +119,7 @@ def main(what: Positional[Literal["curves", "ablations", "timed", "evaluate"]]) 
         jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
     else:
         jobs = [
-            (script, name, seed, [*SHORT, *flags], 1)
+            (script, name, seed, [*SHORT, *flags.split()], 1)
             for seed in (1, 2)
             for name, (script, flags) in ABLATIONS.items()
         ]

@@ -1,9 +1,12 @@
 """What memory is for: Pendulum-v1 without its velocity, by PPO and by recurrent PPO.
 
-The observation keeps cos and sin of the angle; how fast the pendulum turns must be remembered.
-Both scripts get the same steps, batches and constant step size, and no normaliser. Rows of
-benchmark/masked_pendulum.csv are the mean returns of the mean action in 20 episodes, during the run
-and at its end; runs that are there already and long enough are skipped.
+The observation keeps the cosine and the sine of the angle. A policy has to remember them to know
+how fast the pendulum turns. Both scripts get the same number of decisions, batches of the same size
+and the same learning rate, which falls linearly to 0. They do not normalize the observations.
+
+benchmark/masked_pendulum.csv has a row for each evaluation, during the runs and at their ends: the
+mean return of the mean action in 20 episodes. A run that is already there and long enough is
+skipped.
 
     python benchmark/masked_pendulum.py --help
 """
@@ -31,7 +34,7 @@ BATCH = NUM_ENVS * NUM_STEPS
 COMMON = f"""--env-id masked_pendulum:MaskedPendulum-v1
 --num-envs {NUM_ENVS} --num-steps {NUM_STEPS} --gamma 0.9 --reward-scale 0.1 --learning-rate 1e-3
 --update-epochs 10 --hidden-sizes 64 64 --log-std-init 0 --horizon-growth 1 --narrowing 0
---no-normalize-obs --no-anneal-lr --target-kl None --eval-every 5 --torch-threads 1"""
+--no-normalize-obs --target-kl None --eval-every 5 --torch-threads 1"""
 OWN = {"ppo": "--minibatch-size 512", "recurrent_ppo": "--num-minibatches 8"}
 
 

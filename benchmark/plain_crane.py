@@ -1,13 +1,13 @@
 """One crane in plain MuJoCo calls: what throughput.py gives to Gymnasium and Stable-Baselines3.
 
-`NumpyCrane` computes observation, reward and rules as is usual, with NumPy on small arrays,
-`PlainCrane` without NumPy, for speed. Their engine calls are the same.
+`NumpyCrane` computes observation, reward and rules in the usual way, with NumPy on small arrays.
+`PlainCrane` computes them without NumPy, which is faster. Both call the engine in the same way.
 """
 
 import sys
-from collections.abc import Callable
 from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt, tanh
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -18,10 +18,10 @@ import crane_env
 
 
 class PlainCrane(gymnasium.Env):
-    """One crane with plain MuJoCo calls: scalars, views and addresses looked up once.
+    """One crane with plain MuJoCo calls: scalars, and views that are looked up once.
 
-    The task of CraneVectorEnv(signed_yaw=True, axes="crane"). Two things it is spared: info, and
-    the clip of the observation to its space, which an episode that goes on does not reach.
+    The task is ForestryCrane-v0 with its defaults. Two things are left out: `info`, and the clip of
+    the observation to its space. No observation of an episode that goes on needs the clip.
     """
 
     def __init__(self, frame_skip: int = 20):
@@ -30,21 +30,20 @@ class PlainCrane(gymnasium.Env):
         self.frame_skip, self.dt = frame_skip, frame_skip * crane_env.TIMESTEP
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
         self.sensordata, self.warnings = data.sensordata, data.warning
-        joints = [model.joint(name).id for name in crane_env.JOINTS]
-        servos = [model.joint(name).id for name in crane_env.SERVOS]
-        self.q_at = model.jnt_qposadr[joints].tolist()
-        self.dq_at = model.jnt_dofadr[joints][crane_env.ACTUATED].tolist()
-        self.servo_q, self.servo_dq = model.jnt_qposadr[servos], model.jnt_dofadr[servos]
-        integrals = [model.actuator(f"{name}_integral").id for name in crane_env.SERVOS]
-        self.kp = model.actuator_gainprm[integrals, 0]
-        self.lead = model.jnt_actfrcrange[servos, 1] / self.kp
-        self.servos = list(zip(self.servo_q.tolist(), self.lead.tolist()))
-        self.limits = model.jnt_range[joints][crane_env.LIMITED].tolist()
+        self.q_at = crane_env.JOINTS
+        self.dq_at = [crane_env.JOINTS[i] for i in crane_env.ACTUATED]
+        _, integrators = np.split(model.actuator_gainprm, 2)  # after the velocity actuators
+        self.kp = integrators[:, 0]
+        self.lead = model.jnt_actfrcrange[crane_env.SERVOS, 1] / self.kp
+        self.servos = list(zip(crane_env.SERVOS, self.lead.tolist()))
+        joint_range = model.jnt_range[crane_env.JOINTS]
+        tolerance = crane_env.LIMIT_TOLERANCE * np.array([-1, 1])
+        self.limits = (joint_range[crane_env.LIMITED] + tolerance).tolist()
         self.speeds = crane_env.SPEEDS["real"].T.tolist()  # lowest and highest of each joint
         self.log_q = model.joint("log").qposadr[0]
         self.log_body = model.body("log").id
         self.log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
-        low, high = model.jnt_range[joints].T + [[-0.5], [0.5]]
+        low, high = joint_range.T + [[-0.5], [0.5]]
         bound = [10.0] * 6 + [20.0] * 3 + [1.5 * pi]
         low, high = np.float32([*low, *np.negative(bound)]), np.float32([*high, *bound])
         self.observation_space = gymnasium.spaces.Box(low, high)
@@ -67,9 +66,10 @@ class PlainCrane(gymnasium.Env):
         c, s = cos(yaw / 2) / sqrt(2), sin(yaw / 2) / sqrt(2)
         self.qpos[self.log_q : self.log_q + 7] = x, y, radius, c, -c, -s, s
         self.qpos[self.q_at] = q
-        self.qpos[self.servo_q] = q[crane_env.ACTUATED][crane_env.COMMAND_OF_SERVO]
+        self.qpos[crane_env.SERVOS] = q[crane_env.ACTUATED][crane_env.COMMAND_OF_SERVO]
         mujoco.mj_step1(model, data)
-        self.act[:] = self.qpos[self.servo_q] + data.qfrc_bias[self.servo_dq] / self.kp
+        load = data.qfrc_bias[crane_env.SERVOS]
+        self.act[:] = self.qpos[crane_env.SERVOS] + load / self.kp
         self.diameter, self.decisions, self.reached = float(diameter), 0, False
         return self._observe([0.0] * 6)[0], {}
 
@@ -124,7 +124,7 @@ class PlainCrane(gymnasium.Env):
         )
 
     def _observe(self, command: list[float]) -> tuple:
-        """Observation and staged reward, and what the termination rules need."""
+        """Observation, staged reward, and what the termination rules need."""
         qpos, qvel = self.qpos.tolist(), self.qvel.tolist()
         q, dq = [qpos[i] for i in self.q_at], [qvel[i] for i in self.dq_at]
         (gx, gy, gz, ax, ay, _, lx, ly, lz, ux, uy, uz, *touch) = self.sensordata.tolist()
@@ -142,14 +142,16 @@ class PlainCrane(gymnasium.Env):
 
         up = min(abs(uz), 1.0)
         clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        off_centre = (miss / crane_env.CENTRED) ** 2
-        near = min(1.0, exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
-        grasp = 2 * near * exp(-off_centre / 4)
+        beyond = crane_env.NEAR_SHARPNESS * (d_combine - crane_env.REACH_DISTANCE)
+        grasp = min(1.0, exp(-beyond)) * exp(-((miss / crane_env.GRAPPLE_MISS) ** 2))
         clearance = max(clearance, 1e-9)
-        lift = exp(-off_centre) * sqrt(min(clearance, 1 / clearance))
-        reward = exp(-d_combine) + grasp * q[7] / crane_env.Q8_MAX + 2 * lift
+        height = sqrt(min(clearance, 1 / clearance))
+        lift = exp(-((miss / crane_env.LIFT_MISS) ** 2)) * height
+        reward = exp(-crane_env.OMEGA2 * d_combine) + crane_env.LIFT_WEIGHT * lift
+        reward += crane_env.GRAPPLE_WEIGHT * grasp * q[7] / crane_env.Q8_MAX
         if touch[0] > 0 and touch[1] > 0:
-            reward += 3 * (1 - tanh(hypot(*command[:5]))) * lift
+            calm = 1 - tanh(hypot(*command[:5]))
+            reward += crane_env.BALANCE_WEIGHT * calm * lift
         cos_q1, sin_q1 = cos(q[0]), sin(q[0])
         x, y = cos_q1 * x + sin_q1 * y, cos_q1 * y - sin_q1 * x
         return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
@@ -169,7 +171,7 @@ class NumpyCrane(PlainCrane):
         return command
 
     def _clamp(self) -> None:
-        position = self.qpos[self.servo_q]
+        position = self.qpos[crane_env.SERVOS]
         self.act[:] = np.clip(self.act, position - self.lead, position + self.lead)
 
     def _within_limits(self, q: np.ndarray, dq: np.ndarray) -> bool:
@@ -196,13 +198,15 @@ class NumpyCrane(PlainCrane):
         up = np.minimum(np.abs(log_axis[2]), 1.0)
         below = crane_env.LOG_LENGTH / 2 * up + self.diameter / 2 * np.sqrt(1 - up**2)
         clearance = np.maximum(log_centre[2] - below, 1e-9)
-        off_centre = (miss / crane_env.CENTRED) ** 2
-        near = np.minimum(1.0, np.exp(-3 * (d_combine - crane_env.REACH_DISTANCE)))
-        grasp = 2 * near * np.exp(-off_centre / 4) * q[7] / crane_env.Q8_MAX
-        lift = np.exp(-off_centre) * np.sqrt(np.minimum(clearance, 1 / clearance))
-        reward = np.exp(-d_combine) + grasp + 2 * lift
+        beyond = crane_env.NEAR_SHARPNESS * (d_combine - crane_env.REACH_DISTANCE)
+        grasp = np.minimum(1.0, np.exp(-beyond)) * np.exp(-((miss / crane_env.GRAPPLE_MISS) ** 2))
+        height = np.sqrt(np.minimum(clearance, 1 / clearance))
+        lift = np.exp(-((miss / crane_env.LIFT_MISS) ** 2)) * height
+        reward = np.exp(-crane_env.OMEGA2 * d_combine) + crane_env.LIFT_WEIGHT * lift
+        reward += crane_env.GRAPPLE_WEIGHT * grasp * q[7] / crane_env.Q8_MAX
         if np.all(self.sensordata[12:14] > 0):
-            reward += 3 * (1 - np.tanh(np.linalg.norm(command[:5]))) * lift
+            calm = 1 - np.tanh(np.linalg.norm(command[:5]))
+            reward += crane_env.BALANCE_WEIGHT * calm * lift
         c, s = np.cos(q[0]), np.sin(q[0])
         along = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ delta_p
         obs = np.concatenate([q, dq, along, [angle]]).astype(np.float32)
@@ -210,21 +214,22 @@ class NumpyCrane(PlainCrane):
 
 
 def disagreement(
-    make: type[PlainCrane], make_act: Callable, kwargs: dict, frame_skip: int
+    make: type[PlainCrane], policy: Any, options: crane_env.Options, frame_skip: int
 ) -> tuple[float, float]:
     """Largest difference of an observation and of a reward between `make` and CraneVectorEnv.
 
-    Two whole episodes by the policy, which grips and lifts in them, two by noise.
+    Two whole episodes are driven by the policy, which grips and lifts in them, and two by noise.
     """
-    envs = crane_env.CraneVectorEnv(4, **kwargs | {"frame_skip": frame_skip})
+    envs = crane_env.CraneVectorEnv(4, **{**options, "frame_skip": frame_skip})
     plain = [make(frame_skip) for _ in range(4)]
     obs, _ = envs.reset(seed=list(range(4)))
     ours = [env.reset(seed=i)[0] for i, env in enumerate(plain)]
-    ended, act, worst = np.zeros(4, bool), make_act(), np.abs(obs - ours).max()
+    ended, state, worst = np.zeros(4, bool), None, np.abs(obs - ours).max()
     hold, worst_reward, rng = 20 // frame_skip, 0.0, np.random.default_rng(0)
     for decision in range(90 * hold):
         if decision % hold == 0:
-            actions = np.concatenate([act(obs[:2]), rng.uniform(-1.2, 1.2, (2, 6))])
+            chosen, state = policy.predict(obs[:2], state)
+            actions = np.concatenate([chosen, rng.uniform(-1.2, 1.2, (2, 6))])
         obs, rewards, terminated, truncated, _ = envs.advance(actions)
         for i in np.flatnonzero(~ended):
             its_obs, reward, *ends, _ = plain[i].step(actions[i])

@@ -1,4 +1,4 @@
-"""Stable-Baselines3 (SB3) and sb3-contrib on the crane, timed: throughput.py's other side."""
+"""Timed trainings of Stable-Baselines3 (SB3) and sb3-contrib on the crane, for throughput.py."""
 
 import sys
 import time
@@ -44,9 +44,7 @@ class CranesForSB3(VecEnv):
     """CraneVectorEnv as SB3 wants it."""
 
     def __init__(self, frame_skip: int):
-        self.envs = CraneVectorEnv(
-            CRANES, frame_skip, signed_yaw=True, axes="crane", env_threads=THREADS
-        )
+        self.envs = CraneVectorEnv(CRANES, frame_skip=frame_skip, env_threads=THREADS)
         spaces = self.envs.single_observation_space, self.envs.single_action_space
         super().__init__(CRANES, *spaces)
 

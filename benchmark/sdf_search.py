@@ -1,11 +1,15 @@
 """How cheap may MuJoCo's search for SDF contacts be? One policy, 120 trials, several settings.
 
-A setting agrees with MuJoCo's default (40 starts, 10 iterations) in a trial when both succeed
-or both fail; miss_change_m is by how much the grip's place along the log differs, on average over
-trials that both succeed. touches_missed: after 8.5 s the last action is held for 0.5 s, in single
-physics steps; of the jaws of logs that hang before and after, the share without a touch, mean over
-these steps. The grip is firm, so they are contacts that the search did not find. Not of the
-reference, which takes too long. Writes benchmark/sdf_search.csv.
+The reference is MuJoCo's default, 40 starts with 10 iterations each. A setting agrees with it in a
+trial if both succeed or both fail. miss_change_m is how much the distance from the grip to the
+log's centre changes, on average over the trials in which both succeed.
+
+touches_missed is the share of contacts that the search did not find. After 8.5 s the last action is
+held for 0.5 s, in single physics steps. Logs that hang before and after these 0.5 s are gripped
+firmly all the time. A jaw without a touch on such a log is a contact that was missed. The reference
+takes too long for this figure.
+
+Writes benchmark/sdf_search.csv.
 
     python benchmark/sdf_search.py [policy.pt]
 """
@@ -13,30 +17,31 @@ reference, which takes too long. Writes benchmark/sdf_search.csv.
 import csv
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-import tyro  # noqa: E402
-from tyro.conf import Positional  # noqa: E402
+import numpy as np
+import torch
+import tyro
+from tyro.conf import Positional
 
-import eval_crane  # noqa: E402
-from crane_env import MAX_MISS, MIN_CLEARANCE, CraneVectorEnv, monte_carlo_trials  # noqa: E402
+import crane_env
+import eval_crane
+from crane_env import MAX_MISS, MIN_CLEARANCE
 
+RESULTS = Path(__file__).parent / "sdf_search.csv"
 SETTINGS = [(40, 10), (16, 5), (8, 5), (4, 5)]
 SEED, TRIALS = 30_000, 20  # trials per diameter
 
 
-def touches_missed(make_act: Callable, kwargs: dict, diameters: np.ndarray, seeds: list) -> float:
+def touches_missed(policy: Any, envs: crane_env.CraneVectorEnv, seeds: list) -> float:
     """Share of jaws without a touch, over the physics steps of the last 0.5 s and hanging logs."""
-    envs = CraneVectorEnv(len(seeds), diameter=diameters, **kwargs)
     obs, _ = envs.reset(seed=seeds)
-    act, going = make_act(), np.ones(len(seeds), bool)
+    memory, going = None, np.ones(len(seeds), bool)
     for _ in range(round(8.5 / envs.dt)):
-        actions = act(obs)
+        actions, memory = policy.predict(obs, memory)
         obs, _, terminated, _, info = envs.advance(actions)
         going &= ~terminated
     hanging = going & (info["clearance"] > MIN_CLEARANCE) & (info["centre_miss"] < MAX_MISS)
@@ -44,7 +49,7 @@ def touches_missed(make_act: Callable, kwargs: dict, diameters: np.ndarray, seed
     touching = []
     for _ in range(100):
         *_, info = envs.advance(actions)
-        touching.append(envs._state().touching)
+        touching.append(envs.state().touching)
     hanging &= (info["clearance"] > MIN_CLEARANCE) & (info["centre_miss"] < MAX_MISS)
     return 1 - float(np.mean(np.array(touching)[:, hanging]))
 
@@ -52,20 +57,22 @@ def touches_missed(make_act: Callable, kwargs: dict, diameters: np.ndarray, seed
 def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
     """path: policy.pt of a run."""
     torch.set_num_threads(1)
-    make_act, kwargs, _ = eval_crane.load_policy(path, stochastic=False)
-    diameters, seeds = monte_carlo_trials(SEED, TRIALS)
+    policy, task, _ = eval_crane.load_policy(path)
+    env_id, options = eval_crane.task_of(eval_crane.Args(contact="sdf"), task)
+    diameters, seeds = crane_env.monte_carlo_trials(SEED, TRIALS)
     rows, reference = [], None
     for initpoints, iterations in SETTINGS:
-        options = {"contact": "sdf", "sdf_initpoints": initpoints, "sdf_iterations": iterations}
-        options["env_threads"] = 0
+        # `load_model` reads these constants
+        crane_env.SDF_INITPOINTS, crane_env.SDF_ITERATIONS = initpoints, iterations
         start = time.perf_counter()
-        records = eval_crane.run_trials(make_act, {**kwargs, **options}, diameters, seeds)
+        envs = crane_env.make_envs(env_id, len(seeds), diameter=diameters, **options)
+        results = crane_env.run_trials(policy, envs, seeds)
         seconds = time.perf_counter() - start
-        success = np.array([record["success"] for record in records])
-        miss = np.array([record["centre_miss"] for record in records])
+        success, miss = results["success"], results["centre_miss"]
         missed = np.nan  # of the slow reference
         if reference is not None:
-            missed = touches_missed(make_act, {**kwargs, **options}, diameters, seeds)
+            missed = touches_missed(policy, envs.unwrapped, seeds)
+        envs.close()
         reference = (success, miss) if reference is None else reference
         both = success & reference[0]
         row = {
@@ -79,7 +86,7 @@ def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
         }
         rows.append(row)
         print(row, flush=True)
-    with open(Path(__file__).parent / "sdf_search.csv", "w", newline="") as file:
+    with open(RESULTS, "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)

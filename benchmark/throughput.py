@@ -1,26 +1,29 @@
-"""How fast simulator and training are, beside bare MuJoCo, Gymnasium and Stable-Baselines3 (SB3).
+"""Speed of simulator and training, beside bare MuJoCo, Gymnasium and Stable-Baselines3 (SB3).
 
-One run on one machine; the cheap measurements take turns, so that a disturbance hits them all.
-Last come the ratios that matter, each with a bar to pass and an aim.
+All of it is one run on one machine. The cheap measurements take turns, so that a disturbance hits
+all of them. At the end come the ratios that matter, each with a bar to pass and an aim.
 
     pip install -r benchmark/requirements.txt
     python benchmark/throughput.py                      # half an hour; run nothing else
     python benchmark/throughput.py --only physics env   # some parts
     python benchmark/throughput.py --quick              # does it work? its numbers mean nothing
 
-- physics: mujoco.mj_step alone, on the states that the shipped policy visits: the limit.
-- env: CraneVectorEnv driven by that policy, whose own time does not count.
-- vector: the same for Gymnasium's vector environments of `NumpyCrane`, a one-crane environment with
-  NumPy on small arrays, and of `PlainCrane`, without, after a check that both are the same task.
+- physics: mujoco.mj_step alone, on the states that the shipped policy visits. This is the limit.
+- env: CraneVectorEnv driven by that policy. The policy's own time does not count.
+- vector: the same for Gymnasium's vector environments of one-crane environments. `NumpyCrane` is
+  written with NumPy on small arrays, `PlainCrane` without. A check comes first: both are the task
+  of CraneVectorEnv.
 - memory: resident memory of CraneVectorEnv per crane.
-- training: iterations of our scripts and of SB3, from the second on, in two rounds, with the same
-  network, rollout, epochs and minibatch, TRPO's conjugate gradient over 1,024 decisions. SB3 has
-  the arrangement of PlainCrane (PPO also of NumpyCrane) in which its PPO collects fastest,
-  RecurrentPPO also 64 at once, the better of 1 and 2 threads, torch's own settings of them, no
-  monitor and no normalised observations; ours have their default threads, all epochs, and else
-  their defaults.
-  It is the start of a training: no crane holds a log yet. "update" is what follows the rollout;
-  ours contains values, log-probabilities and advantages, which SB3 computes before.
+- training: iterations of our scripts and of SB3, from the second on, in two rounds.
+
+Both sides of the training have the same network, rollout, epochs and minibatch. TRPO solves for its
+direction on 1,024 decisions. SB3 has the number and kind of environments in which its PPO collects
+fastest, and RecurrentPPO also 64 environments at once. SB3 has 1 or 2 threads, whichever is faster,
+with torch's own settings, no monitor and no normalized observations. Our scripts have their default
+threads and run all epochs. Everything else has their defaults.
+
+What is timed is the start of a training: no crane holds a log yet. "update" is what follows the
+rollout. Ours contains values, log-probabilities and advantages, which SB3 computes before.
 """
 
 import csv
@@ -122,11 +125,11 @@ class Sample(NamedTuple):
     kind: str  # "free motion", "held log", or "" between them
 
 
-def record(make_act: Callable, kwargs: dict, decisions: int) -> list[Sample]:
+def record(policy: Any, options: dict, decisions: int) -> list[Sample]:
     """The states that `drive` visits with CRANES cranes, one a decision, crane after crane."""
-    envs = CraneVectorEnv(CRANES, **kwargs | {"frame_skip": HELD_STEPS})
+    envs = CraneVectorEnv(CRANES, **options | {"frame_skip": HELD_STEPS})
     obs, _ = envs.reset(seed=SEED)
-    act, data, done = make_act(), mujoco.MjData(envs.model), np.ones(CRANES, bool)
+    memory, data, done = None, mujoco.MjData(envs.model), np.ones(CRANES, bool)
     models: list[Any] = [None] * CRANES
     samples: list[list[Sample]] = [[] for _ in range(CRANES)]
     for _ in range(decisions):
@@ -137,7 +140,8 @@ def record(make_act: Callable, kwargs: dict, decisions: int) -> list[Sample]:
             state = np.empty(mujoco.mj_stateSize(models[i], STATE))
             mujoco.mj_getState(models[i], data, state, STATE)
             before.append((models[i], state, data.sensordata[12:14] > 0))
-        obs, _, terminated, truncated, info = envs.step(act(obs))
+        actions, memory = policy.predict(obs, memory)
+        obs, _, terminated, truncated, info = envs.step(actions)
         done = terminated | truncated
         for i in np.flatnonzero(~done):  # the controls of an ended episode are gone
             model, state, touching = before[i]
@@ -167,14 +171,14 @@ def replay_in_threads(samples: list[Sample]) -> float:
         return sum(pool.map(replay, [samples[k::THREADS] for k in range(THREADS)]))
 
 
-def drive(make_envs: Callable, make_act: Callable, decisions: int, frame_skip: int) -> float:
+def drive(make_envs: Callable, policy: Any, decisions: int, frame_skip: int) -> float:
     """Decisions/s of envs.step alone."""
     envs = make_envs()
     obs, _ = envs.reset(seed=SEED)
-    act, hold, elapsed = make_act(), HELD_STEPS // frame_skip, 0.0
+    memory, hold, elapsed = None, HELD_STEPS // frame_skip, 0.0
     for step in range(decisions * hold):
         if step % hold == 0:
-            actions = act(obs)
+            actions, memory = policy.predict(obs, memory)
         start = time.perf_counter()
         obs = envs.step(actions)[0]
         elapsed += time.perf_counter() - start
@@ -186,11 +190,11 @@ def env_name(cranes: int = CRANES, threads: int = THREADS, contact: str = "primi
     return f"CraneVectorEnv {cranes} cranes, {threads} threads, {contact}"
 
 
-def cheap_cells(parts: tuple[str, ...], sizes: Sizes, make_act: Callable, kwargs: dict) -> dict:
-    """What to measure by turns: key to unit, repetitions and function."""
+def cheap_cells(parts: tuple[str, ...], sizes: Sizes, policy: Any, options: dict) -> dict:
+    """What to measure by turns: unit, repetitions and function of each key of Results."""
     cells = {}
     if "physics" in parts:
-        samples = record(make_act, kwargs, sizes.decisions)
+        samples = record(policy, options, sizes.decisions)
         runs = {EPISODES: partial(replay, samples)}
         runs[f"{EPISODES}, {THREADS} threads at once"] = partial(replay_in_threads, samples)
         for kind in ("free motion", "held log"):
@@ -202,7 +206,7 @@ def cheap_cells(parts: tuple[str, ...], sizes: Sizes, make_act: Callable, kwargs
 
     def add(part: str, what: str, skip: int, n: int, make_envs: Callable) -> None:
         repetitions = min(3, sizes.repetitions) if n > 64 else sizes.repetitions  # they take long
-        run = partial(drive, make_envs, make_act, sizes.decisions * max(1, 4 // n), skip)
+        run = partial(drive, make_envs, policy, sizes.decisions * max(1, 4 // n), skip)
         cells[part, what, skip] = ("decisions/s", repetitions, run)
 
     for skip in (20, 1):
@@ -210,7 +214,7 @@ def cheap_cells(parts: tuple[str, ...], sizes: Sizes, make_act: Callable, kwargs
             kinds = [("primitive", n, threads) for n in sizes.cranes for threads in (1, 2)]
             for contact, n, threads in [*kinds, ("sdf", CRANES, THREADS)]:
                 own = {"frame_skip": skip, "env_threads": threads, "contact": contact}
-                make = partial(CraneVectorEnv, n, **kwargs | own)
+                make = partial(CraneVectorEnv, n, **options | own)
                 add("env", env_name(n, threads, contact), skip, n, make)
         if "vector" in parts:
             same = {"autoreset_mode": AutoresetMode.SAME_STEP}  # as CraneVectorEnv
@@ -275,7 +279,7 @@ def train_ours(script: str, frame_skip: int, num_steps: int) -> tuple[list[Itera
     rollout = CRANES * num_steps
     threads = eval_crane.ALGORITHMS[script].Args().torch_threads
     flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": threads}
-    flags |= {"frame-skip": frame_skip, "num-steps": num_steps, "update-epochs": EPOCHS}
+    flags |= {"env.frame-skip": frame_skip, "num-steps": num_steps, "update-epochs": EPOCHS}
     flags |= {"total-timesteps": 4 * rollout, "eval-every": 0, "final-trials": 0}
     if script == "recurrent_ppo":
         flags |= {"num-minibatches": MINIBATCHES, "lstm-size": LSTM}
@@ -430,10 +434,11 @@ def main() -> None:
     if hasattr(os, "sched_setaffinity"):  # Linux: as many cores for everybody
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:THREADS])
     print(machine())
-    make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic=False)
+    policy, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    _, options = eval_crane.task_of(eval_crane.Args(), task)
     if {"vector", "training"} & set(args.only):
         for crane, skip in product(PLAIN, (20, 1)):
-            apart = max(disagreement(crane, make_act, kwargs, skip))
+            apart = max(disagreement(crane, policy, options, skip))
             print(f"{crane.__name__} beside CraneVectorEnv, skip {skip}: apart by {apart:.0e}")
             if apart > 1e-3:
                 raise SystemExit(
@@ -441,7 +446,7 @@ def main() -> None:
                 )
 
     results: Results = {}
-    cells = cheap_cells(args.only, sizes, make_act, kwargs)
+    cells = cheap_cells(args.only, sizes, policy, options)
     total = sum(repetitions for _, repetitions, _ in cells.values())
     total += "memory" in args.only
     total += 2 * (sizes.rounds * JOBS + len(PLAIN)) * ("training" in args.only)

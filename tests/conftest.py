@@ -1,1 +1,36 @@
+"""Runs of the algorithm scripts inside the test's own process."""
+
+import runpy
+import signal
+import sys
+
+import pytest
+import torch
+from script_runs import ROOT
+
 import crane_env  # noqa: F401  before any test imports mujoco, which looks for OpenGL as it loads
+
+
+@pytest.fixture
+def run_here(tmp_path, monkeypatch):
+    """run_here(algorithm, *arguments, cwd=tmp_path) gives the variables that the script left.
+
+    As `script_runs.run`, without the seconds that a new process takes to import torch.
+    """
+
+    def run(algorithm, *arguments, cwd=tmp_path):
+        monkeypatch.chdir(cwd)
+        file = str(ROOT / f"{algorithm}_crane.py")
+        monkeypatch.setattr(sys, "argv", [file, *map(str, arguments)])
+        threads, handlers = torch.get_num_threads(), {}
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # where the tests run in the background, some are ignored, and scripts respect that
+            handlers[signum] = signal.signal(signum, signal.SIG_DFL)
+        try:
+            return runpy.run_path(file, run_name="__main__")
+        finally:
+            torch.set_num_threads(threads)
+            for signum, handler in handlers.items():
+                signal.signal(signum, handler)
+
+    return run

@@ -1,8 +1,12 @@
-"""A task of memory, `Recall-v0`: name the cue of the first step four steps later.
+"""Small tasks that show one thing each.
 
-`Echo-v0` is its first step alone, which needs no memory. `Endless-v0` pays 1 for ever, under a time
-limit of 5 steps; `Unbounded-v0` is the same without bounds on the action.
+`Recall-v0` asks for a memory: name the cue of the first step four steps later. `Echo-v0` is its
+first step alone, which needs no memory. `Endless-v0` pays 1 for ever, under a time limit of 5
+steps; `Unbounded-v0` is the same without bounds on the action. `Stuck-v0` never finishes a step.
 """
+
+import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -32,10 +36,6 @@ class Recall(gymnasium.Env):
         return np.array([0, self.time == self.length - 1], np.float32), reward, last, False, {}
 
 
-gymnasium.register("Recall-v0", entry_point=Recall)
-gymnasium.register("Echo-v0", entry_point=Recall, kwargs={"length": 1})
-
-
 class Endless(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
 
@@ -50,5 +50,17 @@ class Endless(gymnasium.Env):
         return np.zeros(1, np.float32), 1.0, False, False, {}
 
 
+class Stuck(Endless):
+    """Leaves a file `stuck` in the working folder and sleeps a minute."""
+
+    def step(self, action):
+        Path("stuck").touch()
+        time.sleep(60)
+        return super().step(action)
+
+
+gymnasium.register("Recall-v0", entry_point=Recall)
+gymnasium.register("Echo-v0", entry_point=Recall, kwargs={"length": 1})
 gymnasium.register("Endless-v0", entry_point=Endless, max_episode_steps=5)
 gymnasium.register("Unbounded-v0", entry_point=Endless, kwargs={"bound": np.inf})
+gymnasium.register("Stuck-v0", entry_point=Stuck)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parent.parent
@@ -30,16 +31,24 @@ def module(algorithm):
     return importlib.import_module(f"{algorithm}_crane")
 
 
+def make_agent(algorithm, obs_dim=18, act_dim=6, **args):
+    script = module(algorithm)
+    bound = np.ones(act_dim)
+    return script.Agent(obs_dim, -bound, bound, script.Args(**{"hidden_sizes": (8,)} | args))
+
+
 def command(algorithm, *arguments):
-    return [sys.executable, str(ROOT / f"{algorithm}_crane.py"), *arguments]
+    return [sys.executable, str(ROOT / f"{algorithm}_crane.py"), *map(str, arguments)]
 
 
-def run(algorithm, cwd, *arguments, check=True):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
-    result = subprocess.run(
-        command(algorithm, *arguments), cwd=cwd, env=environment, capture_output=True, text=True
-    )
-    assert not check or result.returncode == 0, result.stderr[-2000:]
+def environment():
+    return {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
+
+
+def run(algorithm, cwd, *arguments):
+    line = command(algorithm, *arguments)
+    result = subprocess.run(line, cwd=cwd, env=environment(), capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr[-2000:]
     return result
 
 

@@ -1,5 +1,6 @@
 """The environment's contract: spaces, seeds, autoreset, starts, errors."""
 
+import inspect
 import re
 
 import gymnasium
@@ -10,22 +11,84 @@ from gymnasium.utils.env_checker import check_env
 
 import crane_env
 import eval_crane
-from crane_env import CraneEnv, CraneVectorEnv
+from crane_env import DEFAULTS, CraneEnv, CraneVectorEnv, Options
+
+NAMES = ["q1", "q2", "q3", "q4", "q5", "q6", "q7", "q8"]
 
 
 def random_actions(rng, n):
     return rng.uniform(-1, 1, (n, 6))
 
 
-def test_check_env():
-    check_env(gymnasium.make("ForestryCrane-v0").unwrapped, skip_render_check=True)
+@pytest.mark.parametrize("env_id", ["ForestryCrane-v0", "ForestryCranePaper-v0"])
+def test_check_env(env_id):
+    check_env(gymnasium.make(env_id).unwrapped, skip_render_check=True)
 
 
 def test_registered_both_ways():
     env = gymnasium.make("ForestryCrane-v0", frame_skip=5)
-    assert isinstance(env.unwrapped, CraneEnv)
+    assert isinstance(env.unwrapped, CraneEnv) and env.unwrapped.envs.dt == 0.025
     envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=3, reward="paper")
     assert isinstance(envs.unwrapped, CraneVectorEnv) and envs.num_envs == 3
+    assert envs.unwrapped.options == {**DEFAULTS, "reward": "paper"}
+
+
+def test_the_papers_task_is_as_printed():
+    env = gymnasium.make("ForestryCranePaper-v0").unwrapped
+    assert env.envs.options == {
+        "frame_skip": 1,
+        "contact": "sdf",
+        "reward": "paper",
+        "speed": "real",
+        "offset": "minus",
+        "signed_yaw": False,
+        "axes": "world",
+        "pose_noise": "none",
+        "difficulty": 1.0,
+        "curriculum": False,
+        "retry": 0.0,
+        "integrator": "implicit",
+        "solver": "CG",
+    }
+    obs, info = env.reset(seed=0)
+    state, command = env.envs.state(), np.zeros((1, 6))
+    delta_p, delta_psi, _ = crane_env.relative_pose(state, "minus")
+    np.testing.assert_allclose(obs[14:], [*delta_p[0], delta_psi[0]], rtol=1e-6)
+    d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
+    measured = crane_env.log_clearance(state), crane_env.centre_miss(state)
+    terms = crane_env.reward_terms(state, d_combine, *measured, command, "paper")
+    np.testing.assert_allclose([info[term] for term in crane_env.TERMS], terms[:, 0])
+    assert env.envs.dt == 0.005
+    model = env.envs.batch.get_model(0)
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_SDF).any()
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT
+    assert model.opt.solver == mujoco.mjtSolver.mjSOL_CG
+    capsules = gymnasium.make("ForestryCranePaper-v0", contact="primitive").unwrapped
+    assert capsules.envs.options == {**env.envs.options, "contact": "primitive"}
+
+
+def test_options_say_their_defaults():
+    """In parentheses at the end of each comment, as --help and the docstring promise."""
+    source = inspect.getsource(Options)
+    said = dict(re.findall(r"^    (\w+): .*#.* \((\S+)\)$", source, flags=re.M))
+    assert said == {name: str(value) for name, value in DEFAULTS.items()}
+    assert DEFAULTS.keys() == Options.__annotations__.keys()
+    assert CraneVectorEnv(1).options == DEFAULTS
+
+
+def test_columns_are_the_engines():
+    """JOINTS and SERVOS are columns of qpos and of qvel; every servo has two actuators."""
+    model = crane_env.load_model()
+    assert [model.joint(i).name for i in crane_env.JOINTS] == NAMES
+    servos = "q1 q2 q3 q4 q4_stage2 q7 q8 q8_inner".split()
+    assert [model.joint(i).name for i in crane_env.SERVOS] == servos
+    for columns in (model.jnt_qposadr, model.jnt_dofadr):
+        np.testing.assert_array_equal(columns[:10], np.arange(10))
+    moved = model.actuator_trnid[:, 0]
+    np.testing.assert_array_equal(moved, crane_env.SERVOS * 2)
+    actuated = [NAMES[i] for i in crane_env.ACTUATED]
+    commanded = [actuated[i] for i in crane_env.COMMAND_OF_SERVO]
+    assert commanded == [name.split("_")[0] for name in servos]
 
 
 def docstring_table(first_column_values):
@@ -46,9 +109,8 @@ def test_observation_table_matches_the_space():
     np.testing.assert_allclose([float(r[2]) for r in table], space.low, atol=1e-4)
     np.testing.assert_allclose([float(r[3]) for r in table], space.high, atol=1e-4)
     assert space.shape == (18,) and space.dtype == np.float32
-    assert [r[0].split()[0] for r in table[:8]] == crane_env.JOINTS
-    names = [crane_env.JOINTS[i] for i in crane_env.ACTUATED]
-    assert [r[0].split()[0] for r in table[8:14]] == names
+    assert [r[0].split()[0] for r in table[:8]] == NAMES
+    assert [r[0].split()[0] for r in table[8:14]] == [NAMES[i] for i in crane_env.ACTUATED]
 
 
 def test_action_table_matches_the_space_and_speeds():
@@ -61,18 +123,22 @@ def test_action_table_matches_the_space_and_speeds():
         np.testing.assert_allclose(np.array(documented, float).T, crane_env.SPEEDS[speed])
 
 
-def test_observation_holds_what_the_table_says():
-    envs = CraneVectorEnv(4)
+@pytest.mark.parametrize("signed_yaw", [True, False])
+def test_observation_holds_what_the_table_says(signed_yaw):
+    envs = CraneVectorEnv(4, axes="world", signed_yaw=signed_yaw)
     obs, _ = envs.reset(seed=0)
     for _ in range(5):
         obs, *_ = envs.advance(np.full((4, 6), 0.3))
-    state = envs._state()
-    np.testing.assert_allclose(obs[:, :8], state.q, rtol=1e-5, atol=1e-6)
+    state = envs.state()
+    for k, name in enumerate(NAMES):
+        np.testing.assert_allclose(obs[:, k], envs.batch.joint(name).qpos[:, 0], atol=1e-6)
     for k, name in enumerate(["q1", "q2", "q3", "q4", "q7", "q8"]):
         np.testing.assert_allclose(obs[:, 8 + k], envs.batch.joint(name).qvel[:, 0], atol=1e-5)
-    delta_p, delta_psi, _ = crane_env.relative_pose(state)
+    delta_p, delta_psi, signed_angle = crane_env.relative_pose(state)
     np.testing.assert_allclose(obs[:, 14:17], delta_p, atol=1e-5)
-    np.testing.assert_allclose(obs[:, 17], delta_psi, atol=1e-5)
+    assert np.abs(signed_angle - delta_psi).min() > 1e-3
+    expected = signed_angle if signed_yaw else delta_psi
+    np.testing.assert_allclose(obs[:, 17], expected, atol=1e-5)
 
 
 def test_axes_of_the_crane_turn_with_it():
@@ -82,7 +148,7 @@ def test_axes_of_the_crane_turn_with_it():
         envs = CraneVectorEnv(8, axes=axes)
         obs[axes] = envs.reset(seed=0)[0]
         assert obs[axes].flags.c_contiguous  # as what rounds by layout, torch's sums, expects
-    grapple = envs._state().grapple_centre
+    grapple = envs.state().grapple_centre
     ahead = grapple[:, :2] / np.linalg.norm(grapple[:, :2], axis=-1, keepdims=True)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
     delta_p = obs["world"][:, 14:16]
@@ -96,7 +162,7 @@ def test_axes_of_the_crane_turn_with_it():
 
 
 def test_observations_stay_in_the_space():
-    envs = CraneVectorEnv(32, speed="mjcf", signed_yaw=True, pose_noise="step")
+    envs = CraneVectorEnv(32, speed="mjcf", pose_noise="step")
     rng = np.random.default_rng(0)
     obs, _ = envs.reset(seed=0)
     for _ in range(60):
@@ -104,15 +170,19 @@ def test_observations_stay_in_the_space():
         obs, *_ = envs.step(random_actions(rng, 32))
 
 
-def test_a_crane_is_the_same_for_any_number_of_cranes_and_threads():
+def test_a_crane_is_the_same_for_any_number_of_cranes_and_threads(monkeypatch):
+    monkeypatch.setattr(crane_env, "REACH_TIME", 2.0)
+
     def episode(n, threads):
         envs = CraneVectorEnv(n, env_threads=threads, pose_noise="step")
         rng = np.random.default_rng(1)
-        actions = rng.uniform(-1, 1, (150, 6))  # long enough for autoresets
+        actions, ends = rng.uniform(-1, 1, (50, 6)), 0
         obs = [envs.reset(seed=7)[0][2]]
         for action in actions:
             step = envs.step(np.tile(action, (n, 1)))
             obs.append(np.append(step[0][2], step[1][2]))
+            ends += step[2][2]
+        assert ends >= 2
         return np.concatenate(obs)
 
     reference = episode(3, 1)
@@ -145,23 +215,24 @@ def test_sensors_describe_the_state_after_the_step(frame_skip):
         for i in range(2):
             model, data = envs.batch.get_model(i), envs.batch.get_data(i)
             mujoco.mj_forward(model, data)
-            assert np.array_equal(envs._sensors[i], data.sensordata)
+            assert np.array_equal(envs.sensordata[i], data.sensordata)
 
 
 def test_frame_skip_changes_the_decisions_not_the_physics():
     """Same commands at 10, 20, 40 and 200 Hz: the same motion, also with logs in the jaws."""
-    make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic=False)
-    act, commands, ends = make_act(), [], []
+    policy, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    assert task["frame_skip"] == 20
+    commands, ends = [], []
     for frame_skip in (20, 10, 5, 1):
-        envs = CraneVectorEnv(16, **kwargs | {"frame_skip": frame_skip})
+        envs = CraneVectorEnv(8, frame_skip=frame_skip)
         obs, _ = envs.reset(seed=3)
         for k in range(60):
             if frame_skip == 20:
-                commands.append(act(obs))
+                commands.append(policy.predict(obs)[0])
             for _ in range(20 // frame_skip):
                 obs, *_, info = envs.advance(commands[k])
-        assert (info["clearance"] > 0.1).sum() > 3
-        ends.append(envs._qpos.copy())
+        assert (info["clearance"] > 0.1).sum() > 1
+        ends.append(envs.qpos.copy())
     assert all(np.array_equal(ends[0], end) for end in ends)
 
 
@@ -175,11 +246,11 @@ def test_integrators_are_clamped_within_25_ms_from_the_start(frame_skip, period)
     clamped = []
     for k in range(13):
         if k == 3:
-            envs._start_episodes(np.array([1]))  # perhaps between two clamps of the other
-        before = envs._qpos[:, envs._servo_q] + 2 * envs._max_lead
-        envs._act[:] = before
+            envs.start_episodes(np.array([1]))  # perhaps between two clamps of the other
+        before = envs.qpos[:, crane_env.SERVOS] + 2 * envs.max_lead
+        envs.act[:] = before
         envs.advance(np.zeros((2, 6)))
-        clamped.append((envs._act != before).all(axis=1))
+        clamped.append((envs.act != before).all(axis=1))
     first, second = np.array(clamped).T
     assert (first == (np.arange(13) % period == 0)).all()
     assert (second[3:] == (np.arange(10) % period == 0)).all()
@@ -192,7 +263,7 @@ def test_same_step_autoreset():
     twin.reset(seed=0)
     action = np.zeros((8, 6))
     action[::2, 0] = 1.0
-    envs._reach_time[:] = twin._reach_time[:] = 1.0
+    envs.reach_time[:] = twin.reach_time[:] = 1.0
     for _ in range(60):  # slewing at full speed ends at a joint limit, if not before
         obs, _, terminated, _, info = envs.step(action)
         twin_obs, _, _, _, twin_info = twin.advance(action)
@@ -201,7 +272,7 @@ def test_same_step_autoreset():
     assert terminated.any() and not terminated.all()
     assert (info["_final_obs"] == terminated).all() and (info["_final_info"] == terminated).all()
     assert (info["time_to_reach"] == 1.0).all()  # the new starts have not touched it
-    assert np.isinf(envs._reach_time[terminated]).all()
+    assert np.isinf(envs.reach_time[terminated]).all()
     for i in np.flatnonzero(terminated):
         np.testing.assert_array_equal(info["final_obs"][i], twin_obs[i])
         assert info["final_info"]["termination"][i] == twin_info["termination"][i] != "none"
@@ -260,13 +331,13 @@ def test_the_world_starts_as_sampled():
     envs.reset(seed=11)
     for i, seed in enumerate(np.random.SeedSequence(11).spawn(6)):
         q, (x, y, yaw), diameter = crane_env.sample_start(np.random.default_rng(seed))
-        state = envs._state()
+        state = envs.state()
         np.testing.assert_allclose(state.q[i], q)
         np.testing.assert_allclose(state.log_centre[i], [x, y, diameter / 2], atol=1e-12)
         np.testing.assert_allclose(state.log_axis[i], [-np.sin(yaw), np.cos(yaw), 0], atol=1e-12)
         np.testing.assert_allclose(state.diameter[i], diameter)
     assert np.abs(state.dq).max() == 0
-    assert not envs._state().touching.any()
+    assert not envs.state().touching.any()
 
 
 def test_pose_noise_leaves_the_starts_alone():
@@ -285,29 +356,35 @@ def test_pose_noise_is_kept_or_redrawn():
         factors = []
         for _ in range(4):
             obs, *_ = envs.advance(np.zeros((1, 6)))
-            delta_p, _, _ = crane_env.relative_pose(envs._state())
+            delta_p, _, angle = crane_env.relative_pose(envs.state())
             decay = (delta_p**2).sum() / 64
-            factors.append((obs[0, 14] / delta_p[0, 0] - 1) / decay)
-        assert (np.ptp(factors) > 0.01) == redrawn
-        assert np.abs(factors).max() < 0.1 + 1e-3
+            away = np.linalg.norm(obs[0, 14:16]) / np.linalg.norm(delta_p[0, :2])
+            changes = np.array([away, obs[0, 16] / delta_p[0, 2], obs[0, 17] / angle[0]]) - 1
+            factors.append(changes / decay)  # of Delta_p twice, and of its angle
+        factors = np.array(factors)
+        np.testing.assert_allclose(factors[:, 0], factors[:, 1], atol=1e-4)
+        assert ((np.ptp(factors, axis=0) > 0.01) == redrawn).all()
+        assert np.abs(factors).min() > 1e-4 and np.abs(factors).max() < 0.1 + 1e-3
+        assert np.abs(factors[:, 0] - factors[:, 2]).min() > 1e-3  # one draw each
 
 
-def test_retry_starts_failures_again():
+def test_retry_starts_failures_again(monkeypatch):
     """Every episode fails here; after a crane's first start none, half or all are repeats."""
+    monkeypatch.setattr(crane_env, "REACH_TIME", 0.8)
     for retry, low, high in [(0.0, 0, 0), (0.5, 0.35, 0.65), (1.0, 1, 1)]:
         envs = CraneVectorEnv(32, retry=retry)
         obs, _ = envs.reset(seed=0)
         seen, repeated = [{o.tobytes()} for o in obs], []
-        for _ in range(250):
+        for _ in range(60):
             obs, _, terminated, truncated, info = envs.step(np.full((32, 6), [0, -1, 0, 0, 0, 0]))
             assert not info["success"].any()
             for i in np.flatnonzero(terminated | truncated):
                 repeated.append(obs[i].tobytes() in seen[i])
                 seen[i].add(obs[i].tobytes())
         assert len(repeated) > 100 and low <= np.mean(repeated) <= high
-        assert max(len(failures) for failures in envs._failures) == 4
+        assert max(len(failures) for failures in envs.failures) == 4
     envs.reset(seed=0)
-    assert not any(envs._failures)
+    assert not any(envs.failures)
 
 
 def test_retry_leaves_successes_alone(monkeypatch):
@@ -321,11 +398,11 @@ def test_retry_leaves_successes_alone(monkeypatch):
                 pass
         return seen
 
-    env = crane_env.CraneEnv(retry=1.0)
+    env = CraneEnv(retry=1.0)
     env.reset(seed=1)
     with monkeypatch.context() as patch:
         patch.setattr(crane_env, "REACH_DISTANCE", 100.0)
-        patch.setattr(crane_env, "success_conditions", lambda *_: {"success": np.ones(1, bool)})
+        patch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 1), bool))
         assert len(starts(env, 3)) == 3
     assert len(starts(env, 3)) == 1
 
@@ -333,19 +410,69 @@ def test_retry_leaves_successes_alone(monkeypatch):
 def test_difficulty():
     envs = CraneVectorEnv(64, difficulty=0.0)
     envs.reset(seed=0)
-    state = envs._state()
+    state = envs.state()
     delta_p, delta_psi, _ = crane_env.relative_pose(state)
     assert delta_psi.max() < 1e-2  # aligned but for the swing
     easy = np.linalg.norm(delta_p[:, :2], axis=-1)
     np.testing.assert_allclose(state.diameter, 0.55)
     envs.difficulty = 1.0
     envs.reset(seed=0)
-    delta_p, _, _ = crane_env.relative_pose(envs._state())
+    delta_p, _, _ = crane_env.relative_pose(envs.state())
     assert easy.max() < 1.2 and np.linalg.norm(delta_p[:, :2], axis=-1).max() > 3
     rng_easy, rng_full = np.random.default_rng(9), np.random.default_rng(9)
     np.testing.assert_array_equal(
         crane_env.sample_start(rng_easy, 0.3)[0], crane_env.sample_start(rng_full, 1.0)[0]
     )
+
+
+def test_curriculum_rises_with_success():
+    """By 0.05 for more than half of 200 episodes, which then count no more."""
+    envs = CraneVectorEnv(2, curriculum=True)
+    envs.reset(seed=0)
+    _, delta_psi, _ = crane_env.relative_pose(envs.state())
+    assert envs.difficulty == 0 and delta_psi.max() < 1e-2
+    for k in range(200):  # half of them
+        envs.record_end(0, k < 100)
+    assert envs.difficulty == 0
+    envs.record_end(1, False)
+    for _ in range(100):  # 99 that push out a success, one that pushes out a failure
+        envs.record_end(1, True)
+    assert envs.difficulty == 0 and sum(envs.recent_success) == 100
+    envs.record_end(1, True)
+    assert envs.difficulty == 0.05 and not envs.recent_success
+    for _ in range(199):
+        envs.record_end(0, True)
+    assert envs.difficulty == 0.05
+    for _ in range(1 + 20 * 200):
+        envs.record_end(0, True)
+    assert envs.difficulty == 1.0
+    envs.reset(seed=0)
+    state, (_, pose, _) = envs.state(), envs.starts[0]
+    full = CraneVectorEnv(2)
+    full.reset(seed=0)
+    assert envs.difficulty == full.difficulty == 1.0
+    np.testing.assert_array_equal(state.log_centre, full.state().log_centre)
+    np.testing.assert_allclose(state.log_centre[0, :2], pose[:2])
+    for _ in range(201):
+        full.record_end(0, True)
+    fixed = CraneVectorEnv(2, difficulty=0.3)
+    for _ in range(201):
+        fixed.record_end(0, True)
+    assert full.difficulty == 1.0 and fixed.difficulty == 0.3  # no curriculum, no change
+
+
+def test_ends_are_recorded_as_they_come():
+    """Every end counts once, with its success, and only an end."""
+    envs = CraneVectorEnv(16)
+    envs.reset(seed=0)
+    recorded = []
+    envs.record_end = lambda i, success: recorded.append((i, success))
+    rng, ends = np.random.default_rng(0), []
+    for _ in range(70):  # idle cranes last 6 s, others end earlier
+        actions = rng.uniform(-1, 1, (16, 1)) * [[1, 0, 0, 0, 0, 0]] * (np.arange(16) % 2)[:, None]
+        _, _, terminated, truncated, info = envs.step(np.sign(actions))
+        ends += [(i, info["success"][i]) for i in np.flatnonzero(terminated | truncated)]
+    assert len(recorded) >= 16 and recorded == ends
 
 
 def test_trials_do_not_depend_on_how_many_there_are():
@@ -365,10 +492,10 @@ def test_action_is_a_fraction_of_the_speed_limit():
     envs.advance(np.array([[-0.5] * 6, [0.5] * 6]))
     low, high = crane_env.SPEEDS["real"]
     expected = np.stack([0.5 * low, 0.5 * high])[:, crane_env.COMMAND_OF_SERVO]
-    np.testing.assert_allclose(envs._ctrl[:, :8], expected)
-    np.testing.assert_allclose(envs._ctrl[:, 8:], expected)
+    np.testing.assert_allclose(envs.ctrl[:, :8], expected)
+    np.testing.assert_allclose(envs.ctrl[:, 8:], expected)
     envs.advance(np.full((2, 6), 7.0))  # beyond the box: clipped
-    np.testing.assert_allclose(envs._ctrl[0, :8], high[crane_env.COMMAND_OF_SERVO])
+    np.testing.assert_allclose(envs.ctrl[0], [*high[crane_env.COMMAND_OF_SERVO]] * 2)
 
 
 @pytest.mark.parametrize(
@@ -379,24 +506,39 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"num_envs": 0}, "num_envs"),
         ({"frame_skip": 0}, "frame_skip"),
         ({"frame_skip": 2.5}, "frame_skip"),
+        ({"frame_skip": "20"}, r"frame_skip must be a whole number in \[1, 1800\], got '20'"),
         ({"contact": "soft"}, "contact must be one of 'primitive', 'sdf'"),
         ({"reward": "dense"}, "reward"),
         ({"speed": "fast"}, "speed"),
         ({"offset": "none"}, "offset"),
         ({"pose_noise": "much"}, "pose_noise"),
         ({"integrator": "RK45"}, "integrator"),
+        ({"integrator": "Euler"}, "integrator"),
         ({"solver": "LU"}, "solver"),
-        ({"retry": -0.1}, "retry must lie in"),
+        ({"retry": -0.1}, "retry must be a number in"),
+        ({"retry": np.nan}, "retry must be a number in"),
         ({"difficulty": 1.5}, "difficulty"),
         ({"render_mode": "ascii"}, "render_mode"),
         ({"camera": "back"}, "camera"),
-        ({"sdf_initpoints": 0}, "sdf_initpoints"),
+        ({"signed_yaw": "yes"}, "signed_yaw must be one of False, True, got 'yes'"),
+        ({"axes": "boom"}, "axes must be one of 'crane', 'world'"),
+        ({"frame_skp": 5}, "no option 'frame_skp', only frame_skip, contact,"),
+        ({"omega2": 1.0}, "no option 'omega2'"),
         ({"diameter": [0.5, 0.5, 0.5]}, "diameter must be one number or 2 numbers"),
     ],
 )
 def test_bad_arguments(kwargs, words):
     with pytest.raises(ValueError, match=words):
         CraneVectorEnv(**{"num_envs": 2, **kwargs})
+
+
+def test_complete_fills_in_the_defaults_and_leaves_its_argument_alone():
+    given = {"retry": 0.5, "frame_skip": 1800}
+    assert crane_env.complete(given) == {**DEFAULTS, "retry": 0.5, "frame_skip": 1800}
+    assert given == {"retry": 0.5, "frame_skip": 1800}
+    assert crane_env.complete({}) == DEFAULTS and crane_env.complete({}) is not DEFAULTS
+    with pytest.raises(ValueError, match=r"number in \[1, 1800\], got 1801"):
+        crane_env.complete({"frame_skip": 1801})
 
 
 def test_bad_calls():
@@ -420,16 +562,17 @@ def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine logs its warning into the current folder
     envs = CraneVectorEnv(3)
     envs.reset(seed=0)
-    envs._qvel[1] = np.nan
+    envs.qvel[1] = np.nan
     obs, reward, terminated, truncated, info = envs.step(np.zeros((3, 6)))
     assert info["termination"].tolist() == ["none", "diverged", "none"]
     assert terminated.tolist() == [False, True, False] and reward[1] == 0
     assert np.isfinite(obs).all() and np.isfinite(info["final_obs"][1]).all()
+    assert all(np.isfinite(info[term]).all() for term in crane_env.TERMS)  # reports take the mean
     _, _, terminated, _, info = envs.step(np.zeros((3, 6)))
     assert not terminated.any() and set(info["termination"]) == {"none"}
-    state = envs._state()
+    state = envs.state()
     state.q[0], state.dq[1], state.log_centre[2] = np.nan, np.inf, np.nan  # should any get this far
-    obs, _ = envs._observe(state, np.zeros((3, 6)))
+    obs, _ = envs.observe(state, np.zeros((3, 6)))
     assert envs.observation_space.contains(obs)
 
 

@@ -7,19 +7,40 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+import gymnasium
+import imageio
+import mujoco
 import numpy as np
 import pytest
 import torch
 
 import crane_env
 import eval_crane
+from eval_crane import Args, FixedPolicy, judge
 
 ROOT = Path(__file__).parent.parent
+CRANE = "ForestryCrane-v0"
 
 
 def run(*arguments, cwd=ROOT):
     command = [sys.executable, str(ROOT / "eval_crane.py"), *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+
+
+@pytest.fixture
+def run_here(monkeypatch, capsys):
+    """run_here(*arguments) gives standard output and standard error of the judge, run here."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["eval_crane.py", *map(str, arguments)])
+        threads = torch.get_num_threads()
+        try:
+            eval_crane.main()
+        finally:
+            torch.set_num_threads(threads)
+        return capsys.readouterr()
+
+    return run
 
 
 def test_wilson_interval():
@@ -31,14 +52,25 @@ def test_wilson_interval():
 
 
 def test_first_unmet_condition_is_the_failure():
-    info = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, "termination": "time_limit"}
-    info |= {"not_reached": False, "not_lifted": False, "not_held": True, "off_centre": True}
-    assert eval_crane.trial_record(0.5, info)["failure"] == "not_held"
-    assert (
-        eval_crane.trial_record(0.5, {**info, "termination": "overspeed"})["failure"] == "overspeed"
-    )
-    good = {**info, "success": True, "not_held": False, "off_centre": False}
-    assert eval_crane.trial_record(0.5, good)["failure"] == ""
+    end = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, "termination": "time_limit"}
+    end |= {"not_reached": False, "not_lifted": False, "not_held": True, "off_centre": True}
+    kept = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4}
+    assert eval_crane.trial_record(end) == {**kept, "failure": "not_held"}
+    early = {**end, "termination": "overspeed"}
+    assert eval_crane.trial_record(early) == {**kept, "failure": "overspeed"}
+    good = {**end, "success": True, "not_held": False, "off_centre": False}
+    assert eval_crane.trial_record(good) == {**kept, "success": True, "failure": ""}
+
+
+def test_cells():
+    records = [{"diameter": 0.8, "success": True, "failure": ""}] * 3
+    records += [{"diameter": 0.8, "success": False, "failure": "not_held"}]
+    records += [{"diameter": 0.3, "success": False, "failure": "overspeed"}] * 2
+    thin, thick = eval_crane.summarize(records)
+    assert thin["diameter"] == 0.3 and thick["diameter"] == 0.8
+    assert thin["successes"] == 0 and thin["failures"] == {"overspeed": 2}
+    assert thick["success_rate"] == 0.75 and thick["failures"] == {"not_held": 1}
+    assert thick["trials"] == 4 and thick["interval"] == eval_crane.wilson_interval(3, 4)
 
 
 def test_json_and_csv(tmp_path):
@@ -47,7 +79,7 @@ def test_json_and_csv(tmp_path):
     result = run(*arguments, "--json", "--csv", file)
     assert result.returncode == 0, result.stderr
     answer = json.loads(result.stdout)  # standard output holds nothing else
-    assert answer["policy"] == "zero" and answer["seed"] == 5
+    assert answer["policy"] == "zero" and answer["seed"] == 5 and answer["env_id"] == CRANE
     assert answer["contact"] == "primitive" and answer["pose_noise"] == "none"
     assert [cell["diameter"] for cell in answer["cells"]] == [0.4, 0.8]
     for cell in answer["cells"]:
@@ -56,62 +88,154 @@ def test_json_and_csv(tmp_path):
         assert cell["interval"][0] == 0 and 0.6 < cell["interval"][1] < 0.7
     assert answer["mean_success_rate"] == 0
     rows = list(csv.DictReader(file.open()))
-    assert len(rows) == 4 and rows[0]["failure"] == "not_reached"
+    assert [row["diameter"] for row in rows] == ["0.4", "0.4", "0.8", "0.8"]
+    assert {row["failure"] for row in rows} == {"not_reached"}
+    assert {row["pose_noise"] for row in rows} == {"none"}
 
 
-def test_both_tables_unless_noise_is_given():
-    both = run("--policy", "random", "--trials", "1")
-    assert both.returncode == 0, both.stderr
-    assert "Table I, clean" in both.stdout and "Table II, pose noise" in both.stdout
-    assert "| 94 " in both.stdout and "| 88 " in both.stdout and "96.3" in both.stdout
-    one = run("--policy", "random", "--trials", "1", "--pose-noise", "episode")
-    assert one.stdout.count("| mean") == 1
+def test_both_tables_unless_noise_is_given(run_here, tmp_path):
+    file = tmp_path / "trials.csv"
+    both = run_here("--policy", "random", "--trials", "1", "--csv", file).out
+    assert "Table I, clean" in both and "Table II, pose noise" in both
+    assert "| 94 " in both and "| 88 " in both and "96.3" in both
+    rows = list(csv.DictReader(file.open()))
+    assert [row["pose_noise"] for row in rows] == ["none"] * 6 + ["step"] * 6
+    one = run_here("--policy", "random", "--trials", "1", "--pose-noise", "episode").out
+    assert one.count("| mean") == 1 and "Pose noise: random" in one
 
 
 @pytest.mark.parametrize("algorithm", eval_crane.ALGORITHMS)
 def test_shipped_policies_are_of_this_revision(algorithm, capsys):
     path = eval_crane.SHIPPED.with_name(f"{algorithm}_crane.pt")
-    assert eval_crane.load_policy(path, stochastic=False)[2] == algorithm
-    assert capsys.readouterr().err == ""
+    _, task, name = eval_crane.load_policy(path)
+    assert name == algorithm and task["env_id"] == CRANE
+    assert task["revision"] == crane_env.REVISION and capsys.readouterr().err == ""
+    # what a policy is trained on is what is registered, but for its training's own options
+    own = {"difficulty", "curriculum", "retry"}
+    trained = {name: task[name] for name in crane_env.DEFAULTS.keys() - own}
+    assert trained.items() <= crane_env.DEFAULTS.items()
 
 
+@pytest.mark.slow
 def test_shipped_policy_lifts_logs():
     result = run("--json", "--trials", "4", "--diameters", "0.4", "0.6", "--seed", "77")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["mean_success_rate"] >= 0.75
 
 
-def test_scripted_crane_is_judged_like_a_policy():
-    for signed in (True, False):  # environment and script must mean the same angle
-        make_act, kwargs, _ = eval_crane.fixed_policy("scripted", 0, signed)
-        assert kwargs["signed_yaw"] is signed and make_act().signed_yaw is signed
+def test_shipped_policy_in_plain_gymnasium():
+    """gymnasium.make without any option observes what the policy was trained to observe."""
+    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    env, wins = gymnasium.make(CRANE), 0
+    for seed in range(4):
+        obs, _ = env.reset(seed=seed)
+        state, ended = None, False
+        while not ended:
+            actions, state = policy.predict(obs[None], state)
+            obs, _, terminated, truncated, info = env.step(actions[0])
+            ended = terminated or truncated
+        wins += info["success"]
+    assert wins >= 3
+
+
+@pytest.mark.slow
+def test_scripted_crane_is_judged_like_a_policy(run_here):
+    """Environment and script must mean the same angle."""
     for yaw in ("--signed-yaw", "--no-signed-yaw"):
-        result = run("--policy", "scripted", yaw, "--json", "--trials", "1", "--diameters", "0.5")
-        assert result.returncode == 0, result.stderr
-        assert json.loads(result.stdout)["mean_success_rate"] == 1
+        line = ("--policy", "scripted", yaw, "--json", "--trials", "1", "--diameters", "0.5")
+        assert json.loads(run_here(*line).out)["mean_success_rate"] == 1
 
 
-def test_viewer_needs_a_display(monkeypatch):
-    monkeypatch.setattr(eval_crane.sys, "platform", "linux")
-    monkeypatch.setattr(eval_crane.sys, "argv", ["eval_crane.py", "--viewer"])
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
+MINE = "crane_env:ForestryCrane-v0"
+
+
+def options_of(*, policy="file", trained_on=None, **args):
+    arguments = Args(policy=policy, **args)
+    return eval_crane.task_of(arguments, trained_on or {"env_id": CRANE})
+
+
+def test_task_to_judge_on(capsys):
+    other = {"offset": "minus", "axes": "world", "signed_yaw": False, "frame_skip": 10}
+    trained_on = {"env_id": MINE, "revision": 6, **crane_env.complete(other)}
+    trained_on |= {"curriculum": True, "difficulty": 0.0, "retry": 0.25}
+    own = ("curriculum", "difficulty", "retry")  # of the training alone
+    options = {name: trained_on[name] for name in crane_env.DEFAULTS if name not in own}
+    assert options_of(trained_on=trained_on) == (MINE, options)
+    changed = (MINE, options | {"contact": "sdf"})
+    assert options_of(trained_on=trained_on, contact="sdf") == changed
+    assert capsys.readouterr().err == ""
+    # another task is taken as it is registered, and what the policy does not know is said
+    assert options_of(trained_on=trained_on, env_id=CRANE) == (CRANE, {})
+    said = capsys.readouterr().err.splitlines()
+    assert sorted(line.split("=")[0] for line in said) == [
+        f"the policy knows {name}" for name in ("axes", "frame_skip", "offset", "signed_yaw")
+    ]
+    assert "the policy knows axes='world'; ForestryCrane-v0 has 'crane'" in said
+    scripted = {"axes": "crane", "offset": "plus", "signed_yaw": False}
+    paper = "ForestryCranePaper-v0"
+    assert options_of(policy="scripted", env_id=paper, signed_yaw=False) == (paper, scripted)
+    assert options_of(policy="zero", env_id=paper, contact="sdf") == (paper, {"contact": "sdf"})
+
+
+def test_the_shipped_policy_knows_the_registered_task(capsys):
+    _, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    eval_crane.task_of(Args(env_id=CRANE), task)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.slow
+def test_the_papers_task_is_another_than_the_shipped_policys():
+    line = "--env-id ForestryCranePaper-v0 --contact primitive --trials 1 --diameters 0.5 --json"
+    result = run(*line.split())
+    assert result.returncode == 0, result.stderr
+    for known in ("signed_yaw=True", "axes='crane'", "offset='plus'", "frame_skip=20"):
+        assert f"the policy knows {known}; ForestryCranePaper-v0 has " in result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["env_id"] == "ForestryCranePaper-v0" and answer["contact"] == "primitive"
+    assert answer["mean_success_rate"] < 1  # it cannot know where the log is
+
+
+def test_the_contact_model_reported_is_the_one_judged(run_here, monkeypatch):
+    judged = []
+
+    def one_failure(policy, env_id, options, args):
+        envs = crane_env.make_envs(env_id, 1, **options)
+        judged.append(envs.unwrapped.options["contact"])
+        record = {"success": False, "time_to_reach": 1.0, "centre_miss": 0.0}
+        return [{"diameter": 0.5, "failure": "overspeed", **record}]
+
+    monkeypatch.setattr(eval_crane, "judge", one_failure)
+    for contact in ([], ["--contact", "primitive"], ["--contact", "sdf"]):
+        for env_id in (CRANE, "ForestryCranePaper-v0"):
+            line = ("--policy", "zero", "--json", "--env-id", env_id, *contact)
+            assert json.loads(run_here(*line).out)["contact"] == judged[-1]
+    assert judged == ["primitive", "sdf"] + ["primitive"] * 2 + ["sdf"] * 2
+
+
+def test_viewer_needs_a_display(run_here, monkeypatch):
+    monkeypatch.setattr(crane_env, "HEADLESS", True)
     with pytest.raises(SystemExit, match="needs a display"):
-        eval_crane.main()
+        run_here("--viewer")
 
 
-def test_stochastic_and_sdf(monkeypatch):
-    """Sampling changes the trials and the seed makes it repeatable; SDF contact runs."""
-    diameters, seeds = crane_env.monte_carlo_trials(3, 2, (0.5,))
-    times = []
+@pytest.mark.slow
+def test_sampling_is_repeatable():
+    """It changes the trials, and the seed makes it repeatable."""
+    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    misses = []
     for stochastic in (False, True, True):
-        make_act, kwargs, _ = eval_crane.load_policy(eval_crane.SHIPPED, stochastic)
         torch.manual_seed(1)
-        records = eval_crane.run_trials(make_act, kwargs, diameters, seeds)
-        times.append([record["centre_miss"] for record in records])
-    assert times[0] != times[1] and times[1] == times[2]
-    sdf = eval_crane.run_trials(make_act, {**kwargs, "contact": "sdf"}, diameters, seeds)
-    assert len(sdf) == 2
+        args = Args(trials=2, diameters=(0.5,), seed=3, stochastic=stochastic, env_threads=1)
+        misses.append([record["centre_miss"] for record in judge(policy, CRANE, {}, args)])
+    assert misses[0] != misses[1] and misses[1] == misses[2]
+
+
+@pytest.mark.slow
+def test_sdf_trials():
+    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    args = Args(trials=2, diameters=(0.5,), seed=3, env_threads=1)
+    records = judge(policy, CRANE, {"contact": "sdf"}, args)
+    assert len(records) == 2 and any(record["success"] for record in records)
 
 
 @pytest.mark.parametrize("script", eval_crane.SCRIPTS)
@@ -119,24 +243,38 @@ def test_acts_as_the_agent_of_any_algorithm(tmp_path, script):
     torch.manual_seed(0)
     args = script.Args(hidden_sizes=(16,))
     agent = script.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
+    agent.update_normalizer(3 * torch.randn(40, 18) + 1)
     with torch.no_grad():
         agent.actor[-1].weight.mul_(100)
     weights = {k: v for k, v in agent.state_dict().items() if not k.startswith("critic.")}
+    task = {"env_id": CRANE, "revision": crane_env.REVISION, **crane_env.DEFAULTS}
     policy = {"algorithm": script.ALGORITHM, "args": asdict(args), "weights": weights}
-    torch.save(policy, tmp_path / "policy.pt")
-    make_act, _, name = eval_crane.load_policy(tmp_path / "policy.pt", stochastic=False)
-    assert name == script.ALGORITHM
+    torch.save(policy | {"task": task}, tmp_path / "policy.pt")
+    loaded, trained_on, name = eval_crane.load_policy(tmp_path)  # the run's folder or the file
+    assert name == script.ALGORITHM and trained_on == task
     obs = torch.randn(3, 5, 18)  # three decisions of five cranes
-    act, again = make_act(), make_act()
-    acted = torch.stack([torch.as_tensor(act(o.numpy())) for o in obs])
-    if name == "recurrent_ppo":
-        features, _ = agent.remember(obs, agent.initial_state(5), torch.zeros(3, 5))
-        expected = agent.to_env(agent.get_distribution(features).mean)
-        fresh = again(obs[2].numpy())
-        assert np.abs(fresh - acted[2].numpy()).max() > 1e-3  # it remembered the first two
-    else:
-        expected = torch.stack([agent.predict(o) for o in obs])
-    torch.testing.assert_close(acted, expected.detach(), rtol=0, atol=1e-6)
+    with torch.no_grad():
+        seen = agent.normalize(obs)
+        if name == "recurrent_ppo":
+            seen, _ = agent.remember(seen, agent.initial_state(5), torch.zeros(3, 5))
+        expected = agent.to_env(agent.get_distribution(seen).mean)
+    state = None
+    for decision, action in zip(obs, expected):
+        acted, state = loaded.predict(decision.numpy(), state)
+        np.testing.assert_allclose(acted, action, rtol=0, atol=1e-5)
+    assert expected.std() > 0.05
+
+
+def test_fixed_policies():
+    obs = np.zeros((4, 18))
+    actions, _ = FixedPolicy("zero", 1).predict(obs)
+    np.testing.assert_array_equal(actions, np.zeros((4, 6)))
+    first, again, other = (FixedPolicy("random", seed) for seed in (1, 1, 2))
+    actions, _ = first.predict(obs)
+    np.testing.assert_array_equal(actions, again.predict(obs)[0])
+    assert np.abs(actions).max() <= 1 and actions.std() > 0.3
+    assert np.abs(actions - first.predict(obs)[0]).max() > 0.1
+    assert np.abs(actions - other.predict(obs)[0]).max() > 0.1
 
 
 def test_same_trial_in_any_batch(monkeypatch):
@@ -144,34 +282,34 @@ def test_same_trial_in_any_batch(monkeypatch):
 
     With fixed actions to the bit; a network's rounding may change with the size of its batch.
     """
-    make_act, kwargs, _ = eval_crane.fixed_policy("zero", 0)
-    diameters, seeds = crane_env.monte_carlo_trials(3, 4, (0.3, 0.7))
-    together = eval_crane.run_trials(make_act, kwargs, diameters, seeds)
+    args = Args(trials=4, diameters=(0.3, 0.7), seed=3, env_threads=1)
+    together = judge(FixedPolicy("zero", 0), CRANE, {}, args)
+    assert [record["diameter"] for record in together] == [0.3] * 4 + [0.7] * 4
+    assert len({record["centre_miss"] for record in together}) == 8
     monkeypatch.setattr(eval_crane, "CRANES", 3)
-    assert eval_crane.run_trials(make_act, kwargs, diameters, seeds) == together
+    assert judge(FixedPolicy("zero", 0), CRANE, {}, args) == together
 
 
-def test_video(tmp_path):
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+def test_video(tmp_path, run_here, kind):
     try:
-        crane_env.mujoco.Renderer(crane_env.load_model(), 8, 8).close()
+        mujoco.Renderer(crane_env.load_model(), 8, 8).close()
     except Exception as error:
         pytest.skip(f"no OpenGL here: {error}")
-    film = tmp_path / "film.mp4"
-    # an idle crane fails after 6 s: 120 frames
-    result = run("--policy", "zero", "--diameters", "0.5", "--video", film)
-    assert result.returncode == 0, result.stderr
-    import imageio
-
+    film = tmp_path / f"film.{kind}"
+    # an idle crane fails after 6 s: 20 frames a second, two a decision
+    run_here("--policy", "zero", "--diameters", "0.5", "--video", film, "--width", "128")
     frames = imageio.mimread(film, memtest=False)
-    assert len(frames) == 120 and frames[0].shape == (720, 1280, 3)
-    assert np.std(frames[0]) > 10
+    assert frames[0].shape[:2] == (72, 128) and np.std(frames[0]) > 10
+    if kind == "mp4":
+        assert len(frames) == 120
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
 
-def test_clear_errors(tmp_path, monkeypatch):
+def test_clear_errors(tmp_path, run_here):
     def error_of(*arguments):
-        monkeypatch.setattr(sys, "argv", ["eval_crane.py", *map(str, arguments)])
         with pytest.raises(SystemExit) as error:
-            eval_crane.main()
+            run_here(*arguments)
         return str(error.value)
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
@@ -180,34 +318,49 @@ def test_clear_errors(tmp_path, monkeypatch):
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
     assert "brings its own" in error_of("--no-signed-yaw")
     assert "--width must be even and lie in" in error_of("--video", "lift.mp4", "--width", "4000")
+    assert "--width must be even" in error_of("--video", "lift.mp4", "--width", "321")
+    assert "either --video or --viewer" in error_of("--video", "lift.mp4", "--viewer")
     assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
-    (tmp_path / "junk.pt").write_bytes(b"junk")
-    assert "is no policy.pt of this repository" in error_of(tmp_path / "junk.pt")
-    saved = torch.load(eval_crane.SHIPPED, weights_only=True)
-    torch.save({**saved, "algorithm": "sac"}, tmp_path / "sac.pt")
-    assert "unknown algorithm 'sac'; known: mppo_beta, ppo" in error_of(tmp_path / "sac.pt")
-    args = {**saved["args"], "hidden_sizes": (8, 8)}
-    torch.save({**saved, "args": args}, tmp_path / "shape.pt")
-    assert "does not fit a mppo_beta policy" in error_of(tmp_path / "shape.pt")
-    torch.save({**saved, "weights": 3}, tmp_path / "weights.pt")
-    assert "does not fit a mppo_beta policy" in error_of(tmp_path / "weights.pt")
-    torch.save({**saved, "args": 3}, tmp_path / "args.pt")
-    assert "is no policy.pt" in error_of(tmp_path / "args.pt")
-    args = {**saved["args"], "env_id": "Pendulum-v1"}
-    torch.save({**saved, "args": args}, tmp_path / "pendulum.pt")
-    assert "trained on Pendulum-v1" in error_of(tmp_path / "pendulum.pt")
     assert "must lie in [0.3, 0.8]" in error_of("--diameters", "0.2", "--policy", "zero")
     assert "--trials must be at least 1" in error_of("--trials", "0")
     assert "--seed must be at least 0" in error_of("--seed", "-1")
-    assert "--width must be even" in error_of("--video", "lift.mp4", "--width", "321")
+    assert "--env-threads must be at least 0" in error_of("--env-threads", "-1")
     assert "PATH goes with" in error_of(tmp_path / "junk.pt", "--policy", "zero")
     assert "--stochastic goes with" in error_of("--policy", "random", "--stochastic")
     assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
     assert "is a folder" in error_of("--csv", tmp_path)
 
 
-def test_policy_of_another_revision_is_called_so(tmp_path, capsys):
+def test_clear_errors_of_damaged_policies(tmp_path, capsys):
+    path = tmp_path / "policy.pt"
+
+    def error_of(**change):
+        torch.save(saved | change, path)
+        with pytest.raises(SystemExit) as error:
+            eval_crane.load_policy(path)
+        return str(error.value).removeprefix(str(path))
+
     saved = torch.load(eval_crane.SHIPPED, weights_only=True)
-    torch.save({**saved, "task": -1}, tmp_path / "old.pt")
-    eval_crane.load_policy(tmp_path / "old.pt", stochastic=False)
-    assert "old.pt is of another revision" in capsys.readouterr().err
+    known = "mppo_beta, ppo, trpo, recurrent_ppo"
+    assert error_of(algorithm="sac") == f": unknown algorithm 'sac'; known: {known}"
+    assert " does not fit mppo_beta: " in error_of(args=saved["args"] | {"hidden_sizes": (8, 8)})
+    assert " does not fit mppo_beta: " in error_of(args=saved["args"] | {"warp": 9})
+    assert " does not fit mppo_beta: " in error_of(weights=3)
+    assert error_of(args=3) == " is no policy.pt of this repository"
+    assert error_of(task=6) == " is no policy.pt of this repository"  # as the first files had it
+    pendulum = {"env_id": "Pendulum-v1"}
+    assert error_of(task=pendulum) == " was trained on Pendulum-v1, not on the crane"
+    path.write_bytes(b"junk")
+    with pytest.raises(SystemExit, match="is no policy.pt of this repository"):
+        eval_crane.load_policy(path)
+    assert capsys.readouterr().err == ""
+    torch.save(saved | {"task": saved["task"] | {"revision": -1}}, path)
+    eval_crane.load_policy(path)
+    assert "was trained on task revision -1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("policy", ["file", "zero"])
+@pytest.mark.parametrize("env_id", ["Nowhere-v0", "nowhere:Crane-v0", "Pendulum-v1"])
+def test_clear_errors_of_tasks(run_here, policy, env_id):
+    with pytest.raises(SystemExit, match=env_id):
+        run_here("--policy", policy, "--env-id", env_id, "--trials", "1")

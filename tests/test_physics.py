@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import crane_env
-from crane_env import COMMAND_OF_SERVO, CraneVectorEnv, load_model
+from crane_env import COMMAND_OF_SERVO, JOINTS, SERVOS, CraneVectorEnv, load_model
 
 # theta, a, d, alpha of the Denavit-Hartenberg table in assets/README.md; q4 twice
 DH = [
@@ -141,13 +141,14 @@ def test_moving_mass():
     assert abs(mass / 1981 - 1) < 0.005  # the paper's "approximately 1981 kg"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", ["q5", "q6"])
 def test_small_swing_is_that_of_a_damped_compound_pendulum(joint):
     envs = place(HANGING, frame_skip=1)
     for _ in range(12_000):  # a minute, until it hangs still
         envs.advance(np.zeros((1, 6)))
-    index = crane_env.JOINTS.index(joint)
-    q = envs._state().q.copy()
+    index = {"q5": 4, "q6": 5}[joint]
+    q = envs.state().q.copy()
     rest = q[0, index]
 
     model, data = envs.batch.get_model(0), envs.batch.get_data(0)
@@ -176,7 +177,7 @@ def test_small_swing_is_that_of_a_damped_compound_pendulum(joint):
     angles = []
     for _ in range(1200):
         envs.advance(np.zeros((1, 6)))
-        angles.append(envs._state().q[0, index] - rest)
+        angles.append(envs.state().q[0, index] - rest)
     angles = np.array(angles)
     k = np.flatnonzero((angles[:-1] > 0) != (angles[1:] > 0))[:4]
     crossings = 0.005 * (k + angles[k] / (angles[k] - angles[k + 1]))
@@ -197,9 +198,44 @@ def test_each_servo_settles_on_its_command():
     command = np.where(actions < 0, -actions * low, actions * high)[:, COMMAND_OF_SERVO]
     for _ in range(5):
         envs.advance(actions)
-    velocity = envs._qvel[:, envs._servo_dq]
+    velocity = envs.qvel[:, SERVOS]
     error = np.abs(velocity - command) / high[COMMAND_OF_SERVO]
     assert error.max() < 0.02
+
+
+RESTING = {  # joint, end of its range, start before it; other joints where nothing is in the way
+    "q1_right": (0, 0, 0.03, {}),
+    "q1_left": (0, 1, 0.03, {}),
+    "q2_up": (1, 1, 0.1, {2: -0.4}),
+    "q3_up": (2, 1, 0.1, {1: 0.05}),
+    "q4_in": (3, 0, 0.1, {1: 0.9, 2: 0.6}),
+    "q4_out": (3, 1, 0.1, {1: 0.9, 2: 0.6}),
+}
+
+
+def test_resting_in_an_end_stop_ends_no_episode():
+    """Five seconds of full command into soft stops: they give, but less than the rules allow."""
+    n = len(RESTING)
+    q, actions = np.tile(HANGING, (n, 1)), np.zeros((n, 6))
+    which, ends, starts, others = zip(*RESTING.values())
+    joint, end, each = list(which), list(ends), np.arange(n)
+    outward = np.array([-1.0, 1.0])[end]
+    stop = CraneVectorEnv(1).joint_range[joint, end]
+    q[each, joint] = stop - outward * starts
+    actions[each, joint] = outward
+    for i, changes in enumerate(others):
+        for j, value in changes.items():
+            q[i, j] = value
+    q[:, 4] = np.pi / 2 - q[:, 1] - q[:, 2]
+    out, _ = crane_env.tip_position(*q[:, 1:4].T)  # logs below the grapples, within reach
+    envs = place(q, log_pose=np.stack([out * np.cos(q[:, 0]), out * np.sin(q[:, 0]), 0 * out], 1))
+    beyond = []
+    for _ in range(50):
+        info = envs.advance(actions)[-1]
+        assert (info["termination"] == "none").all(), dict(zip(RESTING, info["termination"]))
+        beyond.append(outward * (envs.state().q[each, joint] - stop))
+    assert (np.min(beyond[-20:], axis=0) > 0).all()  # in the stop, not on the way to it
+    assert 0.015 < np.max(beyond) < crane_env.LIMIT_TOLERANCE
 
 
 def test_synchronised_pairs_stay_together():
@@ -216,23 +252,23 @@ def test_idle_crane_stays():
     """Actuated joints hold from any start; all of it holds once the grapple hangs still."""
     envs = CraneVectorEnv(16)
     envs.reset(seed=3)
-    before = envs._state().q.copy()
+    before = envs.state().q.copy()
     for _ in range(90):
         envs.advance(np.zeros((16, 6)))
-    drift = np.abs(envs._state().q - before)[:, crane_env.ACTUATED]
-    tips = [np.stack(crane_env.tip_position(*q[:, 1:4].T)) for q in (before, envs._state().q)]
+    drift = np.abs(envs.state().q - before)[:, crane_env.ACTUATED]
+    tips = [np.stack(crane_env.tip_position(*q[:, 1:4].T)) for q in (before, envs.state().q)]
     assert np.abs(tips[0] - tips[1]).max() < 5e-3
     assert drift.max() < 2e-4
 
     envs = place(HANGING)
     for _ in range(600):
         envs.advance(np.zeros((1, 6)))
-    q = envs._state().q.copy()
+    q = envs.state().q.copy()
     envs.place(np.array([0]), q, np.array([[5.0, -6.0, 0.0]]), np.array([0.55]))
-    start = envs._state().grapple_centre.copy()
+    start = envs.state().grapple_centre.copy()
     for _ in range(90):
         envs.advance(np.zeros((1, 6)))
-        assert np.linalg.norm(envs._state().grapple_centre - start) < 5e-3
+        assert np.linalg.norm(envs.state().grapple_centre - start) < 5e-3
 
 
 def lift(diameter, **kwargs):
@@ -247,17 +283,18 @@ def lift(diameter, **kwargs):
     return envs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("diameter", [0.3, 0.5, 0.8])
 def test_held_log_does_not_sag(diameter):
     """Less than 2 cm in 20 s at zero command."""
     envs = lift(diameter)
-    start = envs._state().log_centre.copy()
-    assert crane_env.log_clearance(envs._state())[0] > 0.3
+    start = envs.state().log_centre.copy()
+    assert crane_env.log_clearance(envs.state())[0] > 0.3
     for _ in range(200):
         envs.advance(np.zeros((1, 6)))
-    sag = start[0, 2] - envs._state().log_centre[0, 2]
+    sag = start[0, 2] - envs.state().log_centre[0, 2]
     assert abs(sag) < 0.02
-    assert envs._state().touching.all()
+    assert envs.state().touching.all()
 
 
 def test_log_mass_and_inertia_follow_the_diameter():
@@ -280,8 +317,7 @@ def closing_at_first_touch(diameter, contact):
     model.geom("log").size[0] = model.geom("log_capsule").size[0] = diameter / 2
     model.geom("log_capsule").size[1] = 2.75 / 2 - diameter / 2
     mujoco.mj_setConst(model, data)
-    for name, value in zip(crane_env.JOINTS, HANGING):
-        data.joint(name).qpos = value
+    data.qpos[JOINTS] = HANGING
     data.joint("q4_stage2").qpos = HANGING[3]
     mujoco.mj_kinematics(model, data)
     frame = data.body("K8").xmat.reshape(3, 3)
@@ -304,7 +340,7 @@ def test_thick_log_is_touched_where_a_thin_one_is_not():
     q = np.tile(q, (2, 1))
     q[:, 7] = 1.75
     envs.place(np.arange(2), q, np.tile(log_pose, (2, 1)), np.array([0.3, 0.8]))
-    assert envs._state().touching.any(axis=-1).tolist() == [False, True]
+    assert envs.state().touching.any(axis=-1).tolist() == [False, True]
 
 
 @pytest.mark.parametrize("diameter", [0.3, 0.55, 0.8])
@@ -341,10 +377,11 @@ def fuzz(envs, steps, seed, autoreset):
         info = (envs.step if autoreset else envs.advance)(actions)[-1]
         diverged += (info["termination"] == "diverged").sum()
         held |= (info["clearance"] > 0.1) & ~info["not_lifted"]
-    assert np.isfinite(envs._qpos).all() and held.any()
+    assert np.isfinite(envs.qpos).all() and held.any()
     return diverged, envs.batch.warning[:, :, 1].sum(), decisions * n * envs.frame_skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", ["real", "mjcf"])
 @pytest.mark.parametrize("autoreset", [True, False], ids=["episodes", "no_rules"])
 def test_fuzz_primitive(speed, autoreset):
@@ -355,6 +392,7 @@ def test_fuzz_primitive(speed, autoreset):
     assert diverged == 0 and warnings == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, solver", [("implicit", "CG"), ("discrete", "Newton")])
 def test_fuzz_other_integrators(integrator, solver):
     envs = CraneVectorEnv(64, integrator=integrator, solver=solver)
@@ -362,6 +400,7 @@ def test_fuzz_other_integrators(integrator, solver):
     assert diverged == 0 and warnings == 0
 
 
+@pytest.mark.slow
 def test_fuzz_sdf():
     diverged, warnings, done = fuzz(CraneVectorEnv(16, contact="sdf"), 50_000, 6, True)
     assert done > 45_000
@@ -409,7 +448,7 @@ def test_crane_does_not_pass_through_the_truck():
     assert 2 in touched
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "implicit", "discrete", "Euler"])
+@pytest.mark.parametrize("integrator", ["implicitfast", "implicit", "discrete"])
 @pytest.mark.parametrize("solver", ["Newton", "CG"])
 def test_integrators_and_solvers_are_passed_on(integrator, solver):
     model = CraneVectorEnv(1, integrator=integrator, solver=solver).batch.get_model(0)
@@ -460,8 +499,8 @@ def test_what_is_only_drawn_changes_no_motion(contact):
         moved.append([])
         for decision in range(30):
             envs.step([[0, decision >= 18, 0, 0, 0, 1]])
-            moved[-1].append([*envs._qpos[0], *envs._qvel[0]])
-        assert envs._state().touching.all() and crane_env.log_clearance(envs._state()) > 0.05
+            moved[-1].append([*envs.qpos[0], *envs.qvel[0]])
+        assert envs.state().touching.all() and crane_env.log_clearance(envs.state()) > 0.05
         models.append(envs.model)
     collides = [(model.geom_contype | model.geom_conaffinity) > 0 for model in models]
     assert collides[0].all() and not collides[1].all() and not models[0].ntex

@@ -73,10 +73,15 @@ def test_gradient_flows_through_time():
 
 def test_acting_step_by_step_is_acting_on_the_sequence():
     agent, (obs, _, _) = make_agent(), sequence()
-    state = agent.initial_state(3)
-    starts = torch.zeros(12, 3)
-    features, _ = agent.remember(agent.normalize(obs), state, starts)
-    expected = agent.to_env(agent.get_distribution(features).mean)
+    with torch.no_grad():
+        agent.actor[-1].weight.mul_(100)
+        features, _ = agent.remember(
+            agent.normalize(obs), agent.initial_state(3), torch.zeros(12, 3)
+        )
+        expected = agent.to_env(agent.get_distribution(features).mean)
+    state = None
     for t in range(12):
-        actions, state = agent.predict(obs[t], state)
-        torch.testing.assert_close(actions, expected[t], rtol=0, atol=1e-6)
+        actions, state = agent.predict(obs[t].numpy(), state)
+        np.testing.assert_allclose(actions, expected[t], rtol=0, atol=1e-5)
+    fresh, _ = agent.predict(obs[11].numpy())
+    assert np.abs(fresh - expected[11]).max() > 1e-2  # the memory mattered

@@ -29,7 +29,7 @@ def test_forward_kinematics_is_the_simulators():
     envs.reset(seed=0)
     log_pose, diameter = np.tile([20.0, 0, 0], (len(q), 1)), np.full(len(q), 0.5)
     envs.place(np.arange(len(q)), q, log_pose, diameter)
-    state, frames = envs._state(), forward_kinematics(q)
+    state, frames = envs.state(), forward_kinematics(q)
     np.testing.assert_allclose(grapple_centre(frames), state.grapple_centre, atol=1e-6)
     np.testing.assert_allclose(frames[-1, :, :3, 0], state.grapple_axis, atol=1e-6)
 
@@ -67,11 +67,12 @@ def test_the_unsigned_angle_is_found_by_turning(angle):
     grapple_axis = forward_kinematics(q)[-1, 0, :3, 0]
     log_yaw = np.arctan2(grapple_axis[1], grapple_axis[0]) + angle - np.pi / 2  # of its own x
     envs.place(np.arange(1), q, np.array([[0.5, -7.0, log_yaw]]), np.array([0.5]))
-    obs, _ = envs._observe(envs._state(), np.zeros((1, 6)))
-    act = ScriptedCrane(signed_yaw=False)
+    obs, _ = envs.observe(envs.state(), np.zeros((1, 6)))
+    policy, memory = ScriptedCrane(signed_yaw=False), None
     assert obs[0, 17] == pytest.approx(1 - np.cos(angle), abs=1e-5)
     for _ in range(15):
-        obs, *_ = envs.advance(act(obs))
+        actions, memory = policy.predict(obs, memory)
+        obs, *_ = envs.advance(actions)
     assert obs[0, 17] < 1 - np.cos(0.2)
     assert obs[0, 6] == pytest.approx(-angle, abs=0.3)  # against yaw, the short way
 
@@ -81,11 +82,28 @@ def test_it_grasps_and_lifts(signed_yaw):
     diameters, seeds = monte_carlo_trials(10_000, 2)
     envs = CraneVectorEnv(len(seeds), diameter=diameters, signed_yaw=signed_yaw, env_threads=1)
     obs, _ = envs.reset(seed=seeds)
-    act, alive = ScriptedCrane(signed_yaw), np.ones(len(seeds), bool)
+    policy, memory, alive = ScriptedCrane(signed_yaw), None, np.ones(len(seeds), bool)
     for _ in range(envs.max_decisions):
-        actions = act(obs)
+        actions, memory = policy.predict(obs, memory)
         assert np.all(np.abs(actions) <= 1)
         obs, _, terminated, _, info = envs.advance(actions)
         alive &= ~terminated
     success = alive & info["success"]
     assert success.all(), dict(zip(diameters[~success], info["termination"][~success]))
+
+
+def test_its_memory_is_that_of_one_batch_of_trials():
+    """No state starts new trials, and trials side by side do not see each other's memory."""
+    rng, policy = np.random.default_rng(0), ScriptedCrane()
+    envs = CraneVectorEnv(2, env_threads=1)
+    trial = [envs.reset(seed=seed)[0] for seed in (1, 2, 3)]  # three decisions of two cranes
+    alone, memory = [], None
+    for obs in trial:
+        actions, memory = policy.predict(obs, memory)
+        alone.append(actions)
+    other, again = policy.predict(rng.normal(size=(5, 18)))[1], None
+    for obs, expected in zip(trial, alone):
+        actions, again = policy.predict(obs, again)
+        np.testing.assert_array_equal(actions, expected)
+        other = policy.predict(rng.normal(size=(5, 18)), other)[1]
+    assert np.abs(policy.predict(trial[2])[0] - alone[2]).max() > 1e-3  # it remembered

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from script_runs import one_minibatch, only_run, run
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from script_runs import one_minibatch, only_run, scalars
 from torch.distributions import Normal
 
 import trpo_crane
@@ -151,24 +150,25 @@ def test_natural_step_spends_the_divergence_it_is_given():
     assert improvement == pytest.approx((gradient @ step).item(), rel=0.01)
 
 
-def test_line_search_must_shorten(tmp_path):
-    result = run("trpo", tmp_path, "--line-search-decay", "1.5", check=False)
-    assert result.returncode == 1
-    assert "--line-search-decay must lie between 0 and 1" in result.stderr
+@pytest.mark.parametrize("decay", [0, 1, 1.5])
+def test_line_search_must_shorten(run_here, decay):
+    with pytest.raises(SystemExit, match=r"--line-search-decay in \(0, 1\)"):
+        run_here("trpo", "--line-search-decay", decay)
 
 
-def test_direction_from_a_sample_length_from_all(tmp_path):
+def test_direction_from_a_sample_length_from_all(tmp_path, run_here):
     weights = {}
     for samples in (8, 64, 1024):
         folder = tmp_path / str(samples)
         folder.mkdir()
-        run("trpo", folder, *one_minibatch("trpo"), "--fisher-samples", str(samples))
+        arguments = [*one_minibatch("trpo"), "--eval-every", "0", "--fisher-samples", samples]
+        run_here("trpo", *arguments, cwd=folder)
         policy = torch.load(only_run(folder) / "policy.pt", weights_only=True)
         weights[samples] = policy["weights"]["actor.0.weight"]
-        events = EventAccumulator(str(only_run(folder))).Reload()
-        assert events.Scalars("trpo/line_search_ok")[0].value == 1
+        values = scalars(only_run(folder))
+        assert values["trpo/line_search_ok"] == [1]
         # the length is that of all 64's curvature, so the line search need not shorten it
-        assert events.Scalars("trpo/step_fraction")[0].value == 1
-        assert 0.02 < events.Scalars("trpo/kl")[0].value <= 0.04
+        assert values["trpo/step_fraction"] == [1]
+        assert 0.02 < values["trpo/kl"][0] <= 0.04
     assert not torch.equal(weights[8], weights[64])
     assert torch.equal(weights[64], weights[1024])  # there are no more than 64
