@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Train an algorithm by the paper's protocol (Vu et al., Sec. IV), as far as the paper states it.
+# Train an algorithm by the paper's protocol (Vu et al., Sec. V), as far as the paper states it.
 #
 #     benchmark/paper.sh                      # mppo_beta; or ppo, trpo, recurrent_ppo
 #     benchmark/paper.sh ppo --env-threads 0  # further arguments go to the training script
@@ -46,7 +46,7 @@ flags=(
     --env-id ForestryCranePaper-v0 --env.retry 0
     --total-timesteps 500_000_000 --num-envs 42 --num-steps 1000
     --hidden-sizes 256 256 256 256 --learning-rate 3e-4 --update-epochs 30
-    --gamma 0.8179 --gae-lambda 0.3585 --horizon-growth 1 --reward-scale 0.02 --narrowing 0
+    --gamma 0.8179 --gae-lambda 0.3585 --horizon-growth 1 --reward-scale 0.2 --narrowing 0
 )
 minibatches=(--minibatch-size 2000)
 case $algorithm in

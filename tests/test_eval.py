@@ -195,6 +195,7 @@ def test_the_papers_task_is_another_than_the_shipped_policys():
     assert answer["mean_success_rate"] < 1  # it cannot know where the log is
 
 
+@pytest.mark.slow
 def test_the_contact_model_reported_is_the_one_judged(run_here, monkeypatch):
     judged = []
 
@@ -290,6 +291,7 @@ def test_same_trial_in_any_batch(monkeypatch):
     assert judge(FixedPolicy("zero", 0), CRANE, {}, args) == together
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mp4", "gif"])
 def test_video(tmp_path, run_here, kind):
     try:

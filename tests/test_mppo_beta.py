@@ -128,6 +128,7 @@ def test_needs_bounded_actions(run_here):
         run_here(ALGORITHM, "--env-id", "recall_env:Unbounded-v0")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "variant, options",
     [

@@ -216,6 +216,7 @@ OWN_KEYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_two_updates_on_the_crane_same_seed_same_weights(tmp_path, run_here, algorithm):
     """In a process of its own and in this one."""
