@@ -338,6 +338,7 @@ def test_killed_run_goes_on(tmp_path, run_here, algorithm):
     run_dir = only_run(tmp_path)
     before = torch.load(run_dir / "checkpoint.pt", weights_only=True)
     assert 10 <= before["iteration"] < 50
+    time.sleep(1.1)  # TensorBoard reads a run's files in the order of the seconds they began in
     for _ in range(2):  # the second time all updates are done
         run_here(algorithm, "--resume", run_dir, "--torch-threads", "1", "--env-threads", "1")
         after = torch.load(run_dir / "checkpoint.pt", weights_only=True)
