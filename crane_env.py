@@ -756,7 +756,7 @@ def run_trials(
 ) -> dict[str, Array]:
     """One whole episode in each environment of `make_envs`: RESULTS, (N,) each.
 
-    policy.predict(obs (N, obs_dim), state, deterministic=...) gives actions (N, act_dim) and the
+    policy.predict(obs (N, obs_dim), state, deterministic=...) returns actions (N, act_dim) and the
     next state. The first state is None. Stable-Baselines3's models have this method too.
     """
     names = RESULTS if isinstance(envs.unwrapped, CraneVectorEnv) else {"episodic_return"}
@@ -779,7 +779,7 @@ def evaluate(
 ) -> dict[str, float]:
     """Mean return and success rates in trials per diameter (other tasks: trials in all).
 
-    The crane's difficulty, curriculum and retry do not count: these are trials of the full task.
+    The crane's difficulty, curriculum and retry are ignored: these are trials of the full task.
     """
     crane = is_crane(env_id)
     if crane:

@@ -76,9 +76,9 @@ class Args:
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     camera: Literal["overview", "side", "grapple"] = "overview"
-    """of the video"""
+    """camera of the video"""
     width: int = 1280
-    """of the video [pixels], 16:9, even, at most 1920"""
+    """width of the video [pixels], even, at most 1920; the format is 16:9"""
     viewer: bool = False
     """show one trial after another in a window instead of judging"""
 
@@ -360,8 +360,8 @@ def main() -> None:
             answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
             print(json.dumps(answer))
         else:
-            what = f"{name} ({source}), {contact} contact, pose noise {noise}, seed {args.seed}"
-            print_table(records, cells, noise, f"{TITLES[noise]}: {what}")
+            what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
+            print_table(records, cells, noise, f"{TITLES[noise]}: {what}, seed {args.seed}")
     if args.csv:
         with open(args.csv, "w", newline="") as file:
             writer = csv.DictWriter(file, all_records[0].keys())

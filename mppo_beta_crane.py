@@ -59,10 +59,10 @@ class Args:
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of an update
     env_threads: int = 2  # CPU threads of the physics, 0 for all cores
-    resume: Path | None = None  # folder of a run to continue, with its own arguments
+    resume: Path | None = None  # continue this run; other flags but device and threads are ignored
 
     # task
-    env_id: str = "ForestryCrane-v0"  # or any Gymnasium task with flat Box spaces
+    env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: int = 64  # cranes simulated side by side
     env: crane_env.Options = field(default_factory=lambda: {"retry": 0.25})
     """options of the crane; in parentheses: what ForestryCrane-v0 has"""
@@ -85,7 +85,7 @@ class Args:
     max_grad_norm: float = 0.5  # bound of the gradient's norm
     perturbation: float = 0.1  # eps at the start, half width of the perturbation of a_n
     log_excess_init: float = 1.5  # log(alpha - 1) and log(beta - 1) at the start, before the bound
-    narrowing: float = 2.5  # rise of both along the run, whatever is learned
+    narrowing: float = 2.5  # total rise of log(alpha - 1) and log(beta - 1) along the run
 
     # evaluation
     eval_every: int = 50  # updates between two evaluations of the mean action, 0 for none
@@ -158,14 +158,14 @@ class Agent(nn.Module):
     def predict(
         self, obs: np.ndarray, state: None = None, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
-        """Actions (B, act_dim) for raw obs (B, obs_dim), and the state of the memory: None."""
+        """Actions (B, act_dim) for raw obs (B, obs_dim), and None: it has no memory."""
         obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
         distribution = self.get_distribution(self.normalize(obs))
         return self.to_env(distribution.mean if deterministic else distribution.sample()), None
 
 
 def perturb_actions(actions: Tensor, epsilon: float) -> Tensor:
-    """Eq. (robust ppo): clip(a_n + g, 0, 1), g ~ U(-epsilon, epsilon); A_MIN off the ends."""
+    """Eq. (robust ppo): clip(a_n + g, 0, 1) with g ~ U(-epsilon, epsilon), A_MIN off 0 and 1."""
     noise = torch.empty_like(actions).uniform_(-1, 1) * epsilon
     return (actions + noise).clamp(A_MIN, 1 - A_MIN)
 
@@ -332,7 +332,7 @@ if __name__ == "__main__":
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = to_tensor(terminated | truncated)
             infos.append(info)
-            cut = truncated & ~terminated  # by the time limit: the task itself goes on
+            cut = truncated & ~terminated  # bootstrap: V stands for what the time limit cut off
             if cut.any():
                 final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))
                 with torch.no_grad():
@@ -383,7 +383,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.actor[-1].bias += args.narrowing / num_iterations  # raises alpha and beta
+            agent.actor[-1].bias += args.narrowing / num_iterations  # by schedule, not by gradient
 
         # Reports
         now = time.time()
@@ -399,9 +399,9 @@ if __name__ == "__main__":
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         finish_update(iteration, report)
 
+    print(f"policy saved to {run_dir / 'policy.pt'}")
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is saved
     if args.final_trials:
         scores = evaluate("final", args.final_trials, num_iterations)
         print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
     writer.close()
-    print(f"policy saved to {run_dir / 'policy.pt'}")

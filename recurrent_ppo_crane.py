@@ -54,10 +54,10 @@ class Args:
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 1  # CPU threads of an update; the LSTM's steps are too small for two
     env_threads: int = 2  # CPU threads of the physics, 0 for all cores
-    resume: Path | None = None  # folder of a run to continue, with its own arguments
+    resume: Path | None = None  # continue this run; other flags but device and threads are ignored
 
     # task
-    env_id: str = "ForestryCrane-v0"  # or any Gymnasium task with flat Box spaces
+    env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: int = 64  # cranes simulated side by side
     env: crane_env.Options = field(default_factory=lambda: {"retry": 0.0})
     """options of the crane; in parentheses: what ForestryCrane-v0 has"""
@@ -80,7 +80,7 @@ class Args:
     vf_coef: float = 0.5  # c_v, weight of the value loss
     max_grad_norm: float = 0.5  # bound of the gradient's norm
     log_std_init: float = -1.2  # log sigma at the start [action units]
-    narrowing: float = 1.25  # fall of log sigma along the run, whatever is learned
+    narrowing: float = 1.25  # total fall of log sigma along the run
 
     # evaluation
     eval_every: int = 50  # updates between two evaluations of the mean action, 0 for none
@@ -344,7 +344,7 @@ if __name__ == "__main__":
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = next_start = to_tensor(terminated | truncated)
             infos.append(info)
-            cut = truncated & ~terminated  # by the time limit: the task itself goes on
+            cut = truncated & ~terminated  # bootstrap: V stands for what the time limit cut off
             if cut.any():
                 final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))[None]
                 no_starts, cut_state = torch.zeros_like(final_obs[..., 0]), [h[cut] for h in state]
@@ -401,7 +401,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.log_std -= args.narrowing / num_iterations
+            agent.log_std -= args.narrowing / num_iterations  # by schedule, not by gradient
 
         # Reports
         now = time.time()
@@ -415,9 +415,9 @@ if __name__ == "__main__":
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         finish_update(iteration, report)
 
+    print(f"policy saved to {run_dir / 'policy.pt'}")
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is saved
     if args.final_trials:
         scores = evaluate("final", args.final_trials, num_iterations)
         print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
     writer.close()
-    print(f"policy saved to {run_dir / 'policy.pt'}")
