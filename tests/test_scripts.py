@@ -305,10 +305,9 @@ def test_the_papers_task_trains(tmp_path, run_here, algorithm):
 def start(algorithm, cwd, *arguments, wait_for="runs/*/checkpoint.pt", ignored=()):
     """A run in a process and a session of its own, once a file like wait_for is there."""
 
-    def handlers():  # where the tests run in the background, Ctrl-C is ignored, and this inherited
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        for signum in ignored:
-            signal.signal(signum, signal.SIG_IGN)
+    def handlers():  # where the tests run in the background, some are ignored, and this inherited
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(signum, signal.SIG_IGN if signum in ignored else signal.SIG_DFL)
 
     process = subprocess.Popen(
         command(algorithm, *small(algorithm), "--eval-every", "0", *arguments),
@@ -325,7 +324,21 @@ def start(algorithm, cwd, *arguments, wait_for="runs/*/checkpoint.pt", ignored=(
             return process
         assert process.poll() is None, process.stderr.read()[-2000:]
         time.sleep(0.05)
+    process.kill()
     raise AssertionError(f"no {wait_for} after five minutes")
+
+
+def next_second():
+    """TensorBoard reads a run's files in the order of the seconds they began in."""
+    time.sleep(1.1)
+
+
+def outcome(process):
+    """What it printed until its end, which must come within two minutes."""
+    try:
+        return process.communicate(timeout=120)
+    finally:
+        process.kill()
 
 
 @pytest.mark.slow
@@ -338,7 +351,7 @@ def test_killed_run_goes_on(tmp_path, run_here, algorithm):
     run_dir = only_run(tmp_path)
     before = torch.load(run_dir / "checkpoint.pt", weights_only=True)
     assert 10 <= before["iteration"] < 50
-    time.sleep(1.1)  # TensorBoard reads a run's files in the order of the seconds they began in
+    next_second()
     for _ in range(2):  # the second time all updates are done
         run_here(algorithm, "--resume", run_dir, "--torch-threads", "1", "--env-threads", "1")
         after = torch.load(run_dir / "checkpoint.pt", weights_only=True)
@@ -364,6 +377,7 @@ def test_curriculum_goes_on_where_it_was(tmp_path, run_here, algorithm):
     checkpoint = torch.load(path, weights_only=True)
     assert checkpoint["difficulty"] == 0 and checkpoint["iteration"] == 2
     torch.save(checkpoint | {"difficulty": 0.35, "iteration": 1}, path)
+    next_second()
     left = run_here(algorithm, "--resume", path.parent)
     assert left["envs"].unwrapped.difficulty == 0.35
     assert left["first_iteration"] == 2 and left["args"].env["curriculum"]
@@ -388,7 +402,7 @@ def test_a_stopped_run_ends_with_its_update(tmp_path, run_here, algorithm, signu
     for file in run_dir.glob("*.pt"):
         file.unlink()  # what is there afterwards was written on the way out
     process.send_signal(signum)
-    output, errors = process.communicate(timeout=60)
+    output, errors = outcome(process)
     assert process.returncode == code, errors[-2000:]
     said = re.search(r"^stopped after update (\d+); go on with --resume (.*)$", output, re.M)
     iteration = int(said[1])
@@ -401,6 +415,7 @@ def test_a_stopped_run_ends_with_its_update(tmp_path, run_here, algorithm, signu
     assert updates == {4.0 * iteration}  # the update under way was finished
     checkpoint["args"]["total_timesteps"] = (iteration + 1) * 64
     torch.save(checkpoint, run_dir / "checkpoint.pt")
+    next_second()
     run_here(algorithm, "--resume", said[2])
     assert scalars(run_dir)["charts/updates"] == list(range(1, iteration + 2))
 
@@ -415,7 +430,7 @@ def test_a_second_ctrl_c_stops_at_once_and_nohup_is_respected(tmp_path):
         time.sleep(0.5)
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=20)
+    outcome(process)
     assert process.returncode == -signal.SIGINT
 
 
