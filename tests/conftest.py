@@ -10,6 +10,8 @@ from script_runs import ROOT
 
 import crane_env  # noqa: F401  before any test imports mujoco, which looks for OpenGL as it loads
 
+torch.set_num_threads(1)  # the batches are too small for more
+
 
 @pytest.fixture
 def run_here(tmp_path, monkeypatch):

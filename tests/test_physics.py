@@ -489,7 +489,7 @@ def test_bands_lie_side_by_side():
         assert set(found) == bands and len(found) == 3 * len(bands)
 
 
-@pytest.mark.parametrize("contact", ["primitive", "sdf"])
+@pytest.mark.parametrize("contact", ["primitive", pytest.param("sdf", marks=pytest.mark.slow)])
 def test_what_is_only_drawn_changes_no_motion(contact):
     """A grip and a lift are bit for bit the same in a model made to be rendered."""
     q, log_pose = grasp_start()

@@ -265,7 +265,9 @@ def test_length_of_an_episode_and_of_its_end(frame_skip, window, decisions):
     assert envs.hold_decisions == window and envs.max_decisions == decisions
 
 
-@pytest.mark.parametrize("frame_skip", [20, 10, 7])
+@pytest.mark.parametrize(
+    "frame_skip", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (10, 7))]
+)
 def test_success_needs_all_of_the_last_half_second(frame_skip, monkeypatch):
     """One decision without a grip spoils success where it lies in the window, and only there."""
     envs = CraneVectorEnv(1, frame_skip=frame_skip)
