@@ -210,6 +210,8 @@ def load_checkpoint(args: Args) -> tuple[dict, Args]:
         revision = checkpoint["task"].get("revision", crane_env.REVISION)  # only the crane has one
         if (checkpoint["algorithm"], revision) != (ALGORITHM, crane_env.REVISION):
             raise ValueError(f"it is of {checkpoint['algorithm']}, task revision {revision}")
+        if not {"weights", "optimizer", "iteration", "difficulty"} <= checkpoint.keys():
+            raise ValueError("it lacks what a checkpoint has, as a policy.pt does")
         machine = ("resume", "device", "torch_threads", "env_threads")
         return checkpoint, Args(**checkpoint["args"] | {k: getattr(args, k) for k in machine})
     except Exception as error:  # a damaged file raises many kinds
@@ -307,11 +309,13 @@ if __name__ == "__main__":
     def stop_after_update(signum: int, frame: object) -> None:
         """Ctrl-C, kill or a closed terminal: finish the update. A second Ctrl-C: stop at once."""
         stop_signals.append(signum)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if signum == signal.SIGINT:
+            signal.signal(signum, signal.SIG_DFL)
 
-    for signum in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}:
-        if signal.getsignal(signum) != signal.SIG_IGN:  # nohup ignores some
-            signal.signal(signum, stop_after_update)
+    signals = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}
+    signals = [s for s in signals if signal.getsignal(s) != signal.SIG_IGN]  # nohup ignores some
+    for signum in signals:
+        signal.signal(signum, stop_after_update)
 
     # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
@@ -416,7 +420,8 @@ if __name__ == "__main__":
         finish_update(iteration, report)
 
     print(f"policy saved to {run_dir / 'policy.pt'}")
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is saved
+    for signum in signals:  # all is saved
+        signal.signal(signum, signal.SIG_DFL)
     if args.final_trials:
         scores = evaluate("final", args.final_trials, num_iterations)
         print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))

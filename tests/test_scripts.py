@@ -501,7 +501,10 @@ def test_clear_errors(tmp_path, run_here, algorithm):
 
     args = vars(module(algorithm).Args())
     task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_env.DEFAULTS}
-    ours = {"algorithm": algorithm, "task": task, "args": args, "optimizer": {}}
+    ours = {"algorithm": algorithm, "task": task, "args": args}
+    (tmp_path / "policy").mkdir()
+    torch.save({**ours, "weights": {}, "global_step": 64}, tmp_path / "policy" / "checkpoint.pt")
+    ours |= {"weights": {}, "optimizer": {}, "iteration": 1, "difficulty": 1.0}
     for name, change in {
         "other": {"algorithm": "other"},
         "task": {"task": task | {"revision": crane_env.REVISION - 1}},
@@ -517,6 +520,7 @@ def test_clear_errors(tmp_path, run_here, algorithm):
         ("other", f"it is of other, task revision {crane_env.REVISION}"),
         ("task", f"it is of {algorithm}, task revision {crane_env.REVISION - 1}"),
         ("more", "unexpected keyword argument 'warp'"),
+        ("policy", "it lacks what a checkpoint has, as a policy.pt does"),
         ("old", ""),
         ("text", ""),
         ("empty", "No such file or directory: 'empty/checkpoint.pt'"),
