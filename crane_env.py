@@ -536,9 +536,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
         self.ctrl[:] = np.tile(command, 2)  # of the velocity servos and of their integrators
         failed = np.zeros(self.num_envs, bool)
-        # Anti-windup: the integrator leads its joint by no more than the force limit can use.
-        # At zero command this lead goes on squeezing the log as a check valve would. Decisions
-        # shorter than ANTI_WINDUP share a clamp, counted from the start of the crane's episode.
+        # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
+        # lead keeps squeezing the log at zero command, as a check valve does. If a decision is
+        # shorter than ANTI_WINDUP, only every k-th decision of an episode clamps the integrators.
         due = self.decisions % max(1, ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, ANTI_WINDUP):
             position = self.qpos[:, SERVOS]
@@ -707,7 +707,8 @@ def make_envs(
 ) -> gymnasium.vector.VectorEnv:
     """N environments of any Gymnasium task, with SAME_STEP autoreset and `info["episode"]`.
 
-    env_threads and options are the crane's. Other tasks refuse options, except retry.
+    env_threads and options are the crane's. Other tasks refuse options. They ignore only retry,
+    which some scripts set by default.
     """
     if is_crane(env_id):
         envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)
@@ -765,7 +766,7 @@ def run_trials(
     while not ended.all():
         actions, state = policy.predict(obs, state, deterministic=deterministic)
         obs, _, terminated, truncated, info = envs.step(actions)
-        first = (terminated | truncated) & ~ended  # later ends are of episodes after the trial
+        first = (terminated | truncated) & ~ended  # later ends belong to other episodes
         if first.any():
             info["episodic_return"] = info["episode"]["r"]
             for name in names:

@@ -59,7 +59,7 @@ class Args:
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 2  # CPU threads of an update
     env_threads: int = 2  # CPU threads of the physics, 0 for all cores
-    resume: Path | None = None  # continue this run; other flags but device and threads are ignored
+    resume: Path | None = None  # run folder to continue; only device and threads can change
 
     # task
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
@@ -317,7 +317,7 @@ if __name__ == "__main__":
         left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         epsilon = args.perturbation * max(0.0, 2 * left - 1)
-        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # after a quarter of the run
+        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
 

@@ -54,7 +54,7 @@ class Args:
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: int = 1  # CPU threads of an update; the LSTM's steps are too small for two
     env_threads: int = 2  # CPU threads of the physics, 0 for all cores
-    resume: Path | None = None  # continue this run; other flags but device and threads are ignored
+    resume: Path | None = None  # run folder to continue; only device and threads can change
 
     # task
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
@@ -329,7 +329,7 @@ if __name__ == "__main__":
         # Schedules
         left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
-        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # after a quarter of the run
+        growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
 

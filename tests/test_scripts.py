@@ -374,6 +374,16 @@ def outcome(process):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_signal_in_the_final_trials_ends_the_run(tmp_path, algorithm):
+    process = start(algorithm, tmp_path, "--total-timesteps", "64", "--final-trials", "300")
+    time.sleep(2)  # 1,800 trials take much longer
+    process.send_signal(signal.SIGTERM)
+    outcome(process)
+    assert process.returncode == -signal.SIGTERM
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_killed_run_goes_on(tmp_path, run_here, algorithm):
     bound = [] if algorithm == "trpo" else ["--target-kl", "None"]
     process = start(algorithm, tmp_path, "--total-timesteps", "3200", *bound)
