@@ -48,14 +48,28 @@ direction. 0 stops the joint; values outside the box are clipped.
 | 5     | q8 jaws          | 1    | -1  | 1    | -1.8, 1.8 rad/s           | -3, 3         |
 """
 
+import contextlib
 import ctypes.util
 import importlib
 import os
 import sys
+import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypedDict, Unpack, get_args, get_type_hints
+from types import NoneType, TracebackType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypedDict,
+    Unpack,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco chooses its OpenGL when it is imported
@@ -63,7 +77,8 @@ if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
+from filelock import FileLock, Timeout
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
@@ -128,13 +143,57 @@ Array = np.ndarray
 # ---- options
 
 
+class Range(NamedTuple):
+    """Lowest and highest value that a number of this `Annotated` type may have."""
+
+    low: float
+    high: float
+
+
+Size = Annotated[int, Range(1, 16_384)]
+Count = Annotated[int, Range(1, 10**10)]
+Threads = Annotated[int, Range(0, 256)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+Share = Annotated[float, Range(0, 1)]
+Factor = Annotated[float, Range(0, 1_000_000)]
+Exponent = Annotated[float, Range(-20, 20)]
+
+
+def check(values: Mapping[str, Any], annotated: Any) -> None:
+    """ValueError says which of the values its annotation does not allow, and what it allows.
+
+    Checked are bools, Literals and numbers with a Range, also in a tuple or beside None.
+    """
+    annotations = get_type_hints(annotated, include_extras=True)
+    for name, value in values.items():
+        if name not in annotations:
+            raise ValueError(f"there is no option {name!r}, only {', '.join(annotations)}")
+        kind, items = annotations[name], [value]
+        if NoneType in get_args(kind):
+            kind, items = get_args(kind)[0], [] if value is None else [value]
+        if get_origin(kind) is tuple:
+            kind, items = get_args(kind)[0], value
+        if get_origin(kind) is Annotated:
+            number, (low, high) = get_args(kind)
+            types = (int, np.integer) if number is int else (int, float, np.number)
+            good = all(isinstance(item, types) and low <= item <= high for item in items)
+            needed = f"a {'whole number' if number is int else 'number'} in [{low:,}, {high:,}]"
+        elif allowed := (False, True) if kind is bool else get_args(kind):
+            good = all(item in allowed for item in items)
+            needed = f"one of {', '.join(map(repr, allowed))}"
+        else:  # a path, a name
+            continue
+        if not good:
+            raise ValueError(f"{name} must be {needed}, got {value!r}")
+
+
 class Options(TypedDict, total=False):
     """What can be changed about the task: keywords of `gymnasium.make`, `--env.*` of the scripts.
 
     In parentheses: the default of ForestryCrane-v0.
     """
 
-    frame_skip: int  # physics steps of 5 ms per decision (20)
+    frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (20)
     contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
     reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
     speed: Literal["real", "mjcf"]  # joint speed limits (real)
@@ -142,9 +201,9 @@ class Options(TypedDict, total=False):
     signed_yaw: bool  # observe the signed angle to the log, not the paper's Delta_psi (True)
     axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
     pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
-    difficulty: float  # 0: easy starts, 1: the full task (1.0)
+    difficulty: Share  # 0: easy starts, 1: the full task (1.0)
     curriculum: bool  # start at difficulty 0 and raise it with the success rate (False)
-    retry: float  # share of episodes that start as a recent failure of that crane did (0.0)
+    retry: Share  # share of episodes that start as a recent failure of that crane did (0.0)
     integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
     solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
 
@@ -158,27 +217,11 @@ PAPER = Options(  # ForestryCranePaper-v0
     frame_skip=1, contact="sdf", reward="paper", offset="minus", signed_yaw=False, axes="world",
     integrator="implicit", solver="CG",
 )  # fmt: skip
-RANGES = {"frame_skip": (1, 1800), "difficulty": (0, 1), "retry": (0, 1)}
 
 
 def complete(options: Options) -> Options:
     """The options with all defaults filled in. ValueError names a wrong one and what is allowed."""
-    types = get_type_hints(Options)
-    for name, value in options.items():
-        if name not in types:
-            raise ValueError(f"the crane has no option {name!r}, only {', '.join(types)}")
-        if name in RANGES:
-            low, high = RANGES[name]
-            whole = types[name] is int
-            kind = (int, np.integer) if whole else (int, float, np.number)
-            good = isinstance(value, kind) and low <= value <= high
-            needed = f"be a {'whole number' if whole else 'number'} in [{low}, {high}]"
-        else:
-            allowed = get_args(types[name]) or (False, True)
-            good = value in allowed
-            needed = f"be one of {', '.join(map(repr, allowed))}"
-        if not good:
-            raise ValueError(f"{name} must {needed}, got {value!r}")
+    check(options, Options)
     return {**DEFAULTS, **options}
 
 
@@ -375,38 +418,43 @@ def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:
 
 
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
-    """N cranes stepped together on one `mujoco.batch.Batch`; SAME_STEP autoreset.
+    """N cranes stepped together on one `mujoco.batch.Batch`.
 
     Crane i's starts depend on the seed, on i and, with retry, on its failures; not on N or threads.
 
     `info` describes the step just made, for every crane, also one whose episode just ended:
     `termination` (one of TERMINATIONS, or "none"), the reward's TERMS, `d_combine`, `clearance`,
-    `centre_miss` (m), `time_to_reach` (s, inf before), and, meaningful where an episode ended,
-    `success` and which of CONDITIONS failed it. `final_obs` and `final_info` hold the end of an
-    episode, under the masks `_final_obs` and `_final_info`.
+    `centre_miss` (m), `time_to_reach` (s, inf before), and, where an episode ended, `success`,
+    the same as `is_success` for Stable-Baselines3, and which of CONDITIONS failed it. The mask
+    `_key` says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of
+    an episode.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata = {
+        "render_modes": ["rgb_array"] if HEADLESS else ["human", "rgb_array"],
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
     def __init__(
         self,
-        num_envs: int = 1,  # N
+        num_envs: Size = 1,  # N
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
-        env_threads: int = 0,  # physics threads, 0 for all cores
-        render_mode: str | None = None,  # or "human", "rgb_array"
-        camera: str = "overview",  # or "side", "grapple"
-        width: int = 640,
-        height: int = 480,
+        env_threads: Threads = 0,  # physics threads, 0 for all cores
+        render_mode: Literal["human", "rgb_array"] | None = None,
+        camera: Literal["overview", "side", "grapple"] = "overview",
+        width: Annotated[int, Range(1, 1920)] = 640,
+        height: Annotated[int, Range(1, 1080)] = 480,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,  # or NEXT_STEP
         **options: Unpack[Options],
     ):
-        if num_envs != int(num_envs) or num_envs < 1:
-            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs}")
-        if render_mode not in (None, "human", "rgb_array"):
-            raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode}")
-        if camera not in ("overview", "side", "grapple"):
-            raise ValueError(f"camera must be 'overview', 'side' or 'grapple', got {camera!r}")
+        given = {"num_envs": num_envs, "env_threads": env_threads, "render_mode": render_mode}
+        given |= {"camera": camera, "width": width, "height": height}
+        check(given, CraneVectorEnv.__init__)
         if render_mode == "human" and HEADLESS:  # the window's library would end the process
             raise RuntimeError("render_mode 'human' needs a display, and DISPLAY is not set")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode == AutoresetMode.DISABLED:
+            raise ValueError("autoreset_mode must be SAME_STEP or NEXT_STEP; `advance` resets none")
         if diameter is not None:
             d = np.asarray(diameter, float)
             if d.shape not in [(), (num_envs,)] or not np.all((D_MIN <= d) & (d <= D_MAX)):
@@ -416,6 +464,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.options = options = complete(options)
         self.task = {"revision": REVISION, **options}  # what a trained policy knows of it
         self.num_envs, self.fixed_diameter = int(num_envs), diameter
+        self.process = os.getpid()
         self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
         self.viewer = None  # the window, or the renderer of "rgb_array"
         self.speed, self.frame_skip = SPEEDS[options["speed"]], int(options["frame_skip"])
@@ -424,6 +473,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
         self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1  # with both its ends
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
+        self.metadata["autoreset_mode"] = self.autoreset_mode
 
         engine = options["contact"], options["integrator"], options["solver"]
         self.model = load_model(*engine, visual=render_mode is not None)
@@ -442,6 +492,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.decisions = np.zeros(self.num_envs, int)  # since the start of each episode
         self.reach_time = np.full(self.num_envs, np.inf)  # s
         self.streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
+        self.resting = np.zeros(self.num_envs, bool)  # NEXT_STEP: ended in the step before
         self.starts: list[tuple] = [()] * self.num_envs
         self.recent_success = deque(maxlen=200)  # of ended episodes
         self.rngs: list[tuple[Generator, Generator]] | None = None
@@ -468,21 +519,37 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             # starts and pose noise have streams of their own: noise leaves the starts as they are
             self.rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
             self.failures = [deque(maxlen=4) for _ in seeds]
-        return self.start_episodes(np.arange(self.num_envs))
+        self.resting[:] = False
+        obs, info = self.start_episodes(np.arange(self.num_envs))
+        return obs, info | {f"_{key}": np.ones(self.num_envs, bool) for key in info}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance every crane by one decision, actions (N, 6); start anew where an episode ends."""
+        """Advance every crane by one decision, actions (N, 6), and start anew after an end.
+
+        SAME_STEP: where an episode ends, the observation is that of the next start. NEXT_STEP: it
+        is that of the end. The next step ignores the action there and gives the start, reward 0.
+        """
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
-        if done.any():
-            ended = np.flatnonzero(done)
+        of_ends = {"success", "is_success", *CONDITIONS}
+        everywhere = np.ones(self.num_envs, bool)
+        info |= {f"_{key}": done if key in of_ends else everywhere for key in info}
+        again = done
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            again, self.resting = self.resting, done
+        elif done.any():
             info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
-            for i in ended:
+            for i in np.flatnonzero(done):
                 info["final_obs"][i] = obs[i].copy()
             info["_final_obs"] = info["_final_info"] = done
-            starts, _ = self.start_episodes(ended)
-            obs[ended] = starts[ended]
+        if again.any():
+            starts, start_info = self.start_episodes(np.flatnonzero(again))
+            obs[again] = starts[again]
+            if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+                reward[again], info["time_to_reach"][again] = 0.0, np.inf
+                for key, values in start_info.items():
+                    info[key][again] = values[again]
         return obs, reward, terminated, truncated, info
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -508,12 +575,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.streaks = (self.streaks + 1) * gripped
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
+        ending[self.resting] = "none"
         truncated = ending == "time_limit"
         terminated = (ending != "none") & ~truncated
         # Success, for training, evaluation and tests alike: the log was reached in time, each of
         # the grip's conditions held at every decision of the last HOLD_TIME, nothing ended early.
         failed = ~np.array([reached, *(self.streaks >= self.hold_decisions)])
         info |= dict(zip(CONDITIONS, failed)) | {"success": truncated & ~failed.any(axis=0)}
+        info["is_success"] = info["success"]
         info |= {"termination": ending, "time_to_reach": self.reach_time.copy()}
         reward = sum(info[term] for term in TERMS)
         for i in np.flatnonzero(ending != "none"):
@@ -534,6 +603,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def simulate(self, command: Array) -> Array:
         """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
+        self.stay_in_process()
         self.ctrl[:] = np.tile(command, 2)  # of the velocity servos and of their integrators
         failed = np.zeros(self.num_envs, bool)
         # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
@@ -575,6 +645,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
+        self.stay_in_process()
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         radius, (x, y, yaw) = diameter / 2, log_pose.T
         # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
@@ -627,6 +698,39 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         space = self.single_observation_space
         return np.clip(obs, space.low, space.high).astype(np.float32, order="C"), info
 
+    def stay_in_process(self) -> None:
+        """RuntimeError in a forked process, where waiting for the threads would never end."""
+        if os.getpid() != self.process and self.batch.nthread > 1:
+            raise RuntimeError("make the cranes after the fork, or with env_threads=1")
+
+    def __reduce__(self) -> None:
+        raise TypeError("cranes cannot be copied or pickled; make new ones, as AsyncVectorEnv does")
+
+    @property
+    def difficulty(self) -> float:
+        """Of the next starts; 0: easy, 1: the full task."""
+        return self._difficulty
+
+    @difficulty.setter
+    def difficulty(self, value: float) -> None:
+        check({"difficulty": value}, Options)
+        self._difficulty = value
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """The attribute, once a crane, as Gymnasium's SyncVectorEnv gives it."""
+        return (getattr(self, name),) * self.num_envs
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute that all cranes share: one value, or a list of N equal ones."""
+        values = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if not hasattr(self, name):
+            raise AttributeError(f"cranes have no attribute {name!r}")
+        if values != values[:1] * self.num_envs:
+            raise ValueError(
+                f"all cranes share {name}: give one value or {self.num_envs} equal ones"
+            )
+        setattr(self, name, values[0])
+
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
         if self.render_mode == "rgb_array":
@@ -658,8 +762,11 @@ class CraneEnv(gymnasium.Env):
     """One crane: a thin view of `CraneVectorEnv`, whose arguments it takes except num_envs."""
 
     metadata = CraneVectorEnv.metadata
+    _spec: EnvSpec | None = None
 
     def __init__(self, **kwargs: Any):
+        if "autoreset_mode" in kwargs:
+            raise ValueError("one crane has no autoreset_mode: reset() it after an episode")
         self.envs = CraneVectorEnv(num_envs=1, **{"env_threads": 1, **kwargs})
         self.metadata = {k: v for k, v in self.envs.metadata.items() if k != "autoreset_mode"}
         self.render_mode = self.envs.render_mode
@@ -669,12 +776,33 @@ class CraneEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
-        return obs[0], {key: value[0] for key, value in info.items()}
+        return obs[0], {key: value[0] for key, value in info.items() if not key.startswith("_")}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        if np.shape(action) != self.action_space.shape:
+            raise ValueError(f"an action must have shape (6,), got {np.shape(action)}")
         obs, reward, terminated, truncated, info = self.envs.advance(np.asarray(action)[None])
         info = {key: value[0] for key, value in info.items()}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    @property
+    def difficulty(self) -> float:
+        """As `CraneVectorEnv.difficulty`."""
+        return self.envs.difficulty
+
+    @difficulty.setter
+    def difficulty(self, value: float) -> None:
+        self.envs.difficulty = value
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of the task, with the length of an episode in decisions."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        # the registered task cannot have this length, which depends on frame_skip
+        self._spec = spec and replace(spec, max_episode_steps=self.envs.max_decisions)
 
     def render(self) -> Array | None:
         frames = self.envs.render()
@@ -690,6 +818,42 @@ gymnasium.register("ForestryCranePaper-v0", kwargs=PAPER, **CLASSES)
 
 
 # ---- training and judging
+
+
+def one_line_errors(hint: str = "") -> None:
+    """From now on, files that cannot be used and Ctrl-C end with one line and no traceback.
+
+    hint follows a file's error. All other errors keep their traceback.
+    """
+
+    def report(kind: type, error: BaseException, trace: TracebackType | None) -> None:
+        if not issubclass(kind, (OSError, KeyboardInterrupt)):
+            return sys.__excepthook__(kind, error, trace)
+        interrupted = issubclass(kind, KeyboardInterrupt)
+        line = "interrupted" if interrupted else f"{kind.__name__}: {error}{hint}"
+        with contextlib.suppress(OSError):
+            print(f"\n{line}", file=sys.stderr, flush=True)
+        if issubclass(kind, BrokenPipeError):  # Python must not write what is left into the pipe
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.dup2(nowhere, sys.stderr.fileno())
+
+    sys.excepthook = report
+    # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
+    threading.excepthook = lambda args: (
+        None if issubclass(args.exc_type, OSError) else sys.__excepthook__(*args[:3])
+    )
+
+
+def lock_folder(folder: Path) -> FileLock:
+    """Make a run's folder and hold its lock while the process lives. SystemExit if another does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / "lock", blocking=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise SystemExit(f"another process trains in {folder}") from None
+    return lock
 
 
 def is_crane(env_id: str) -> bool:
@@ -791,9 +955,9 @@ def evaluate(
         envs, seeds = make_envs(env_id, trials, **options), seed
     results = run_trials(policy, envs, seeds)
     envs.close()
-    scores = {"episodic_return": results["episodic_return"].mean()}
+    scores = {"episodic_return": results["episodic_return"].mean().item()}
     if crane:
-        scores["success_rate"] = results["success"].mean()
+        scores["success_rate"] = results["success"].mean().item()
         for d in DIAMETERS:
-            scores[f"success_rate_{d}m"] = results["success"][diameters == d].mean()
+            scores[f"success_rate_{d}m"] = results["success"][diameters == d].mean().item()
     return scores

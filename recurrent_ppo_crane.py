@@ -24,7 +24,7 @@ from collections import defaultdict
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 # OpenMP workers spin briefly before they sleep: low latency, and two runs can share two cores.
 os.environ.setdefault("GOMP_SPINCOUNT", "5000")
@@ -39,8 +39,11 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import crane_env
+from crane_env import Count, Exponent, Factor, Range, Seed, Share, Size, Threads
 
 ALGORITHM = "recurrent_ppo"
+MAX_BATCH = 2**20  # decisions of a rollout, all in memory
+CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads"}
 SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
 State = tuple[Tensor, Tensor]  # h and c of the LSTM, (N, lstm_size) each
 
@@ -49,44 +52,47 @@ State = tuple[Tensor, Tensor]  # h and c of the LSTM, (N, lstm_size) each
 class Args:
     # experiment
     exp_name: str = "recurrent_ppo_crane"  # name of the run's folder
-    seed: int = 1  # seed of the networks, the policy's samples and the episodes
-    total_timesteps: int = 1_024_000  # decisions to train for, over all cranes
+    seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
+    total_timesteps: Count = 1_024_000  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: int = 1  # CPU threads of an update; the LSTM's steps are too small for two
-    env_threads: int = 2  # CPU threads of the physics, 0 for all cores
-    resume: Path | None = None  # run folder to continue; only device and threads can change
+    torch_threads: Annotated[int, Range(1, 256)] = 1  # CPU threads of an update; two are slower
+    env_threads: Threads = 2  # CPU threads of the physics, 0 for all cores
+    resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 
     # task
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
-    num_envs: int = 64  # cranes simulated side by side
+    num_envs: Size = 64  # cranes simulated side by side
     env: crane_env.Options = field(default_factory=lambda: {"retry": 0.0})
     """options of the crane; in parentheses: what ForestryCrane-v0 has"""
 
     # algorithm
-    num_steps: int = 64  # decisions per crane and rollout
-    hidden_sizes: tuple[int, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    lstm_size: int = 64  # width of the memory that actor and critic read
+    num_steps: Size = 64  # decisions per crane and rollout
+    hidden_sizes: tuple[Size, ...] = (256, 256)  # hidden layers of the actor and of the critic
+    lstm_size: Size = 64  # width of the memory that actor and critic read
     normalize_obs: bool = True  # scale observations by their running mean and deviation
-    learning_rate: float = 7e-4  # Adam's step size at the start
-    gamma: float = 0.97  # discount per 0.1 s at the start
-    horizon_growth: float = 3.0  # 1 / (1 - gamma) grows by this factor along the run
-    gae_lambda: float = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: float = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
-    num_minibatches: int = 4  # groups of cranes; one gradient step on the rollouts of each
-    update_epochs: int = 8  # passes over each rollout
-    clip_coef: float = 0.2  # c, bound of the ratio's change
-    target_kl: float | None = 0.04  # stop after the first epoch whose mean KL estimate exceeds this
-    ent_coef: float = 0.0  # c_e, weight of the entropy
-    vf_coef: float = 0.5  # c_v, weight of the value loss
-    max_grad_norm: float = 0.5  # bound of the gradient's norm
-    log_std_init: float = -1.2  # log sigma at the start [action units]
-    narrowing: float = 1.25  # total fall of log sigma along the run
+    learning_rate: Factor = 7e-4  # Adam's step size at the start
+    gamma: Share = 0.97  # discount per 0.1 s at the start
+    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
+    gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
+    reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
+    num_minibatches: Size = 4  # groups of cranes; one gradient step on the rollouts of each
+    update_epochs: Size = 8  # passes over each rollout
+    clip_coef: Factor = 0.2  # c, bound of the ratio's change
+    target_kl: Factor | None = 0.04  # stop after the first epoch whose mean KL exceeds this
+    ent_coef: Factor = 0.0  # c_e, weight of the entropy
+    vf_coef: Factor = 0.5  # c_v, weight of the value loss
+    max_grad_norm: Factor = 0.5  # bound of the gradient's norm
+    log_std_init: Exponent = -1.2  # log sigma at the start [action units]
+    narrowing: Exponent = 1.25  # total fall of log sigma along the run
 
     # evaluation
-    eval_every: int = 50  # updates between two evaluations of the mean action, 0 for none
-    eval_trials: int = 20  # trials per log diameter in each evaluation
-    final_trials: int = 100  # trials per log diameter after the training, 0 for none
-    eval_seed: int = 10_000  # seed of all trials
+    eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
+    eval_trials: Annotated[int, Range(1, 1000)] = 20  # trials per log diameter in each evaluation
+    final_trials: Annotated[int, Range(0, 1000)] = 100  # the same after the training, 0 for none
+    eval_seed: Seed = 10_000  # seed of all trials
+
+    def __post_init__(self) -> None:
+        crane_env.check(vars(self), Args)
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -202,35 +208,44 @@ def compute_gae(
     return advantages
 
 
-def load_checkpoint(args: Args) -> tuple[dict, Args]:
-    """checkpoint.pt of the run to resume and the run's arguments, except those of the machine."""
+def load_checkpoint(folder: Path) -> tuple[dict, Args]:
+    """checkpoint.pt in a run's folder, and the run's arguments with those of the command line."""
+    path = folder / "checkpoint.pt"
+    if not path.is_file():
+        raise SystemExit(f"--resume: there is no {path}")
     try:
-        path = args.resume / "checkpoint.pt"
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        revision = checkpoint["task"].get("revision", crane_env.REVISION)  # only the crane has one
-        if (checkpoint["algorithm"], revision) != (ALGORITHM, crane_env.REVISION):
-            raise ValueError(f"it is of {checkpoint['algorithm']}, task revision {revision}")
+        task, algorithm = checkpoint["task"], checkpoint["algorithm"]
+        revision = task.get("revision", crane_env.REVISION)  # only the crane has one
+        if (algorithm, revision) != (ALGORITHM, crane_env.REVISION):
+            raise ValueError(f"it is of {algorithm}, task revision {revision}")
         if not {"weights", "optimizer", "iteration", "difficulty"} <= checkpoint.keys():
             raise ValueError("it lacks what a checkpoint has, as a policy.pt does")
-        machine = ("resume", "device", "torch_threads", "env_threads")
-        return checkpoint, Args(**checkpoint["args"] | {k: getattr(args, k) for k in machine})
+        # every option as it was, should a default have changed since
+        options = {name: task[name] for name in crane_env.DEFAULTS if name in task}
+        saved = Args(**checkpoint["args"] | {"env": options})
     except Exception as error:  # a damaged file raises many kinds
         reason = str(error).partition("\n")[0]
-        raise SystemExit(f"--resume: no usable checkpoint.pt in {args.resume}: {reason}") from None
+        raise SystemExit(f"--resume: {path} is damaged or does not fit: {reason}") from None
+    args = tyro.cli(Args, default=saved)
+    for name, value in vars(saved).items():
+        if value != getattr(args, name) and name not in CHANGEABLE:
+            raise SystemExit(f"--resume: this run has {name} {value}; leave the argument out")
+    return checkpoint, args
 
 
 if __name__ == "__main__":
+    crane_env.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     checkpoint = None
     if args.resume is not None:
-        checkpoint, args = load_checkpoint(args)
+        checkpoint, args = load_checkpoint(args.resume)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda: torch finds no GPU; use --device cpu")
     device = torch.device(args.device)
-    sizes = (args.num_envs, args.num_steps, args.num_minibatches, args.eval_trials)
-    if min(sizes) < 1 or min(args.seed, args.eval_seed) < 0:
-        raise SystemExit("sizes and --eval-trials must be at least 1, seeds at least 0")
     batch_size = args.num_envs * args.num_steps
+    if batch_size > MAX_BATCH:
+        raise SystemExit(f"--num-envs times --num-steps must be at most {MAX_BATCH:,}")
     num_iterations = max(1, args.total_timesteps // batch_size)
     if args.num_envs % args.num_minibatches or batch_size < 2 * args.num_minibatches:
         raise SystemExit("--num-envs must be a multiple of --num-minibatches, --num-steps above 1")
@@ -265,10 +280,15 @@ if __name__ == "__main__":
     # Files
     run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
     run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
+    lock = crane_env.lock_folder(run_dir)
+    print(f"writing to {run_dir}", flush=True)
+    crane_env.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
     task = {"env_id": args.env_id, **(envs.unwrapped.task if is_crane else {})}
     stop_signals: list[int] = []
+    remaining = range(first_iteration, num_iterations + 1)
+    final_scores = {} if checkpoint is None or remaining else checkpoint.get("final_scores", {})
 
     def save(iteration: int) -> None:
         """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
@@ -279,8 +299,11 @@ if __name__ == "__main__":
         policy |= {"weights": acting, "global_step": iteration * batch_size}
         state = {"weights": weights, "optimizer": optimizer.state_dict(), "iteration": iteration}
         state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0
+        state["final_scores"] = final_scores
         for name, contents in (("policy", policy), ("checkpoint", policy | state)):
-            torch.save(contents, run_dir / f"{name}.tmp")  # a kill leaves the old file whole
+            with open(run_dir / f"{name}.tmp", "wb") as file:
+                torch.save(contents, file)
+            # a kill or a full disk leaves the old file whole
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
 
     def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
@@ -292,6 +315,11 @@ if __name__ == "__main__":
 
     def finish_update(iteration: int, report: dict[str, float]) -> None:
         """Write the report. Evaluate and save when it is time to, and stop if a signal came."""
+        wrong = [name for name, value in report.items() if not np.isfinite(value)]
+        if wrong or not all(tensor.isfinite().all() for tensor in agent.state_dict().values()):
+            progress.close()
+            what = ", ".join(wrong) or "the weights"
+            raise SystemExit(f"update {iteration}: {what} not finite; lower --learning-rate")
         for key, value in report.items():
             writer.add_scalar(key, value, iteration * batch_size)
         last = iteration == num_iterations
@@ -323,7 +351,8 @@ if __name__ == "__main__":
     rewards, dones, starts = torch.zeros((3, args.num_steps, args.num_envs), device=device)
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
-    remaining = range(first_iteration, num_iterations + 1)
+    if not remaining:
+        print("all updates are done; a larger --total-timesteps extends the run")
     progress = tqdm(remaining, initial=first_iteration - 1, total=num_iterations)
     for iteration in progress:
         # Schedules
@@ -419,10 +448,12 @@ if __name__ == "__main__":
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         finish_update(iteration, report)
 
-    print(f"policy saved to {run_dir / 'policy.pt'}")
+    print(f"policy saved to {run_dir / 'policy.pt'}", flush=True)
     for signum in signals:  # all is saved
         signal.signal(signum, signal.SIG_DFL)
-    if args.final_trials:
-        scores = evaluate("final", args.final_trials, num_iterations)
-        print("\n".join(f"final/{name}: {value:.3f}" for name, value in scores.items()))
+    if args.final_trials and not final_scores:
+        final_scores = evaluate("final", args.final_trials, num_iterations)
+        save(num_iterations)
+    for name, score in final_scores.items():
+        print(f"final/{name}: {score:.3f}", flush=True)
     writer.close()

@@ -3,12 +3,13 @@
 import runpy
 import signal
 import sys
+import threading
 
 import pytest
 import torch
 from script_runs import ROOT
 
-import crane_env  # noqa: F401  before any test imports mujoco, which looks for OpenGL as it loads
+import crane_env  # before any test imports mujoco, which looks for OpenGL as it loads
 
 torch.set_num_threads(1)  # the batches are too small for more
 
@@ -19,6 +20,11 @@ def run_here(tmp_path, monkeypatch):
 
     As `script_runs.run`, without the seconds that a new process takes to import torch.
     """
+
+    lock_folder, locks = crane_env.lock_folder, []
+    monkeypatch.setattr(crane_env, "lock_folder", lambda folder: locks.append(lock_folder(folder)))
+    for module in (sys, threading):
+        monkeypatch.setattr(module, "excepthook", module.excepthook)  # what scripts set ends here
 
     def run(algorithm, *arguments, cwd=tmp_path):
         monkeypatch.chdir(cwd)
@@ -32,6 +38,8 @@ def run_here(tmp_path, monkeypatch):
             return runpy.run_path(file, run_name="__main__")
         finally:
             torch.set_num_threads(threads)
+            for lock in locks:  # which a script holds until its process ends
+                lock.release()
             for signum, handler in handlers.items():
                 signal.signal(signum, handler)
 

@@ -506,7 +506,7 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"num_envs": 0}, "num_envs"),
         ({"frame_skip": 0}, "frame_skip"),
         ({"frame_skip": 2.5}, "frame_skip"),
-        ({"frame_skip": "20"}, r"frame_skip must be a whole number in \[1, 1800\], got '20'"),
+        ({"frame_skip": "20"}, r"frame_skip must be a whole number in \[1, 1,800\], got '20'"),
         ({"contact": "soft"}, "contact must be one of 'primitive', 'sdf'"),
         ({"reward": "dense"}, "reward"),
         ({"speed": "fast"}, "speed"),
@@ -537,7 +537,7 @@ def test_complete_fills_in_the_defaults_and_leaves_its_argument_alone():
     assert crane_env.complete(given) == {**DEFAULTS, "retry": 0.5, "frame_skip": 1800}
     assert given == {"retry": 0.5, "frame_skip": 1800}
     assert crane_env.complete({}) == DEFAULTS and crane_env.complete({}) is not DEFAULTS
-    with pytest.raises(ValueError, match=r"number in \[1, 1800\], got 1801"):
+    with pytest.raises(ValueError, match=r"number in \[1, 1,800\], got 1801"):
         crane_env.complete({"frame_skip": 1801})
 
 

@@ -151,9 +151,9 @@ def test_natural_step_spends_the_divergence_it_is_given():
 
 
 @pytest.mark.parametrize("decay", [0, 1, 1.5])
-def test_line_search_must_shorten(run_here, decay):
-    with pytest.raises(SystemExit, match=r"--line-search-decay in \(0, 1\)"):
-        run_here("trpo", "--line-search-decay", decay)
+def test_line_search_must_shorten(decay):
+    with pytest.raises(ValueError, match=r"line_search_decay must be a number in \[0.01, 0.99\]"):
+        Args(line_search_decay=decay)
 
 
 def test_direction_from_a_sample_length_from_all(tmp_path, run_here):
