@@ -173,12 +173,14 @@ def check(values: Mapping[str, Any], annotated: Any) -> None:
             kind, items = get_args(kind)[0], [] if value is None else [value]
         if get_origin(kind) is tuple:
             kind, items = get_args(kind)[0], value
-        if get_origin(kind) is Annotated:
-            number, (low, high) = get_args(kind)
-            types = (int, np.integer) if number is int else (int, float, np.number)
+        limits = getattr(kind, "__metadata__", [None])[0]
+        if isinstance(limits, Range):
+            (low, high), whole = limits, get_args(kind)[0] is int
+            types = (int, np.integer) if whole else (int, float, np.number)
             good = all(isinstance(item, types) and low <= item <= high for item in items)
-            needed = f"a {'whole number' if number is int else 'number'} in [{low:,}, {high:,}]"
-        elif allowed := (False, True) if kind is bool else get_args(kind):
+            needed = f"a {'whole ' if whole else ''}number in [{low:,}, {high:,}]"
+        elif get_origin(kind) is Literal or kind is bool:
+            allowed = get_args(kind) or (False, True)
             good = all(item in allowed for item in items)
             needed = f"one of {', '.join(map(repr, allowed))}"
         else:  # a path, a name
@@ -762,6 +764,7 @@ class CraneEnv(gymnasium.Env):
     """One crane: a thin view of `CraneVectorEnv`, whose arguments it takes except num_envs."""
 
     metadata = CraneVectorEnv.metadata
+    __reduce__ = CraneVectorEnv.__reduce__
     _spec: EnvSpec | None = None
 
     def __init__(self, **kwargs: Any):

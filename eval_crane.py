@@ -14,8 +14,11 @@ import csv
 import json
 import os
 import sys
+import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -31,7 +34,18 @@ import mppo_beta_crane
 import ppo_crane
 import recurrent_ppo_crane
 import trpo_crane
-from crane_env import CONDITIONS, DIAMETERS, make_envs, monte_carlo_trials, run_trials
+from crane_env import (
+    CONDITIONS,
+    D_MAX,
+    D_MIN,
+    DIAMETERS,
+    Range,
+    Seed,
+    Threads,
+    make_envs,
+    monte_carlo_trials,
+    run_trials,
+)
 from scripted_crane import ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
@@ -59,15 +73,15 @@ class Args:
     """what --policy scripted observes: the signed angle to the log or the paper's Delta_psi"""
     pose_noise: Literal["none", "step", "episode"] | None = None
     """error of the observed log pose; unset: the table without and the one with `step`"""
-    trials: int = 100
+    trials: Annotated[int, Range(1, 10_000)] = 100
     """trials per log diameter"""
-    diameters: tuple[float, ...] = DIAMETERS
+    diameters: tuple[Annotated[float, Range(D_MIN, D_MAX)], ...] = DIAMETERS
     """log diameters [m]"""
-    seed: int = 40_000
+    seed: Seed = 40_000
     """seed of the trials"""
     stochastic: bool = False
     """sample actions instead of taking the mean action"""
-    env_threads: int = 0
+    env_threads: Threads = 0
     """physics threads, 0 for all cores"""
     csv: Path | None = None
     """write one row a trial to this file"""
@@ -77,10 +91,13 @@ class Args:
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     camera: Literal["overview", "side", "grapple"] = "overview"
     """camera of the video"""
-    width: int = 1280
-    """width of the video [pixels], even, at most 1920; the format is 16:9"""
+    width: Annotated[int, Range(64, 1920)] = 1280
+    """width of the video [pixels], even; the format is 16:9"""
     viewer: bool = False
     """show one trial after another in a window instead of judging"""
+
+    def __post_init__(self) -> None:
+        crane_env.check(vars(self), Args)
 
 
 def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
@@ -226,6 +243,17 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
     print("log centre, along the log. Both are means over the successes.")
 
 
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A path to write to. Once all is written it becomes `path`; of a failure nothing is left."""
+    unfinished = path.with_name(f"unfinished_{path.name}")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
 def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
     """One trial per diameter, 20 frames a second. A frame is also taken halfway through a decision
     of 0.1 s.
@@ -240,27 +268,22 @@ def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
     gif = args.video.suffix == ".gif"
     how = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
-    unfinished = args.video.with_name(f"unfinished_{args.video.name}")
     frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
     bar, mean = tqdm(total=frames, unit="frame", leave=False), not args.stochastic
-    try:
-        with bar, imageio.get_writer(unfinished, **how) as video:
-            for diameter, seed in zip(diameters, seeds):
-                crane = make_envs(env_id, 1, diameter=diameter, **scene).unwrapped
-                obs, _ = crane.reset(seed=[seed])
-                state, ended, step = None, False, 0
-                while not ended:
-                    if step % substeps == 0:
-                        actions, state = policy.predict(obs, state, deterministic=mean)
-                    obs, _, terminated, truncated, _ = crane.advance(actions)
-                    if step % frame_every == 0:
-                        video.append_data(crane.render()[0])
-                        bar.update()
-                    ended, step = terminated[0] or truncated[0], step + 1
-                crane.close()
-        os.replace(unfinished, args.video)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with whole_file(args.video) as path, bar, imageio.get_writer(path, **how) as video:
+        for diameter, seed in zip(diameters, seeds):
+            crane = make_envs(env_id, 1, diameter=diameter, **scene).unwrapped
+            obs, _ = crane.reset(seed=[seed])
+            state, ended, step = None, False, 0
+            while not ended:
+                if step % substeps == 0:
+                    actions, state = policy.predict(obs, state, deterministic=mean)
+                obs, _, terminated, truncated, _ = crane.advance(actions)
+                if step % frame_every == 0:
+                    video.append_data(crane.render()[0])
+                    bar.update()
+                ended, step = terminated[0] or truncated[0], step + 1
+            crane.close()
     print(f"{len(seeds)} trials filmed in {args.video}")
 
 
@@ -282,17 +305,9 @@ def show(policy: Any, env_id: str, options: dict, args: Args) -> None:
 
 def check(args: Args) -> None:
     """SystemExit that names a wrong argument and its mend."""
-    low, high = crane_env.D_MIN, crane_env.D_MAX
     from_file, wrong_use = args.policy == "file", "goes with --policy file only"
     for wrong, message in [
-        (args.trials < 1, f"--trials must be at least 1, got {args.trials}"),
-        (args.seed < 0, f"--seed must be at least 0, got {args.seed}"),
-        (args.env_threads < 0, f"--env-threads must be at least 0, got {args.env_threads}"),
         (not args.diameters, "--diameters needs at least one number"),
-        (
-            not all(low <= d <= high for d in args.diameters),
-            f"--diameters must lie in [{low}, {high}] m, got {args.diameters}",
-        ),
         (not from_file and args.path != SHIPPED, f"PATH {wrong_use}"),
         (not from_file and args.stochastic, f"--stochastic {wrong_use}"),
         (
@@ -308,10 +323,7 @@ def check(args: Args) -> None:
             args.video and args.video.suffix not in (".mp4", ".gif"),
             f"--video: {args.video} must end in .mp4 or .gif",
         ),
-        (
-            args.width % 2 or not 64 <= args.width <= 1920,
-            f"--width must be even and lie in [64, 1920], got {args.width}",
-        ),
+        (args.width % 2, f"--width must be even, got {args.width}"),
         (
             args.viewer and crane_env.HEADLESS,
             "--viewer needs a display, and DISPLAY is not set; use --video lift.mp4",
@@ -322,11 +334,15 @@ def check(args: Args) -> None:
     for path in (args.video, args.csv):
         if path and not path.parent.is_dir():
             raise SystemExit(f"no folder {path.parent}; make it first")
-        if path and path.is_dir():
-            raise SystemExit(f"{path} is a folder; name a file")
+        if path and path.exists() and not path.is_file():
+            raise SystemExit(f"{path} is no file; name a file")
+        if path:  # a full or read-only disk is better met before the work
+            with tempfile.TemporaryFile(dir=path.parent) as probe:
+                probe.write(b"x")
 
 
 def main() -> None:
+    crane_env.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     check(args)
     task = {"env_id": "ForestryCrane-v0"}
@@ -358,19 +374,17 @@ def main() -> None:
             mean = sum(cell["successes"] for cell in cells) / len(records)
             answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
             answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
-            print(json.dumps(answer))
+            print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
             print_table(records, cells, noise, f"{TITLES[noise]}: {what}, seed {args.seed}")
+    sys.stdout.flush()
     if args.csv:
-        with open(args.csv, "w", newline="") as file:
+        with whole_file(args.csv) as path, open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, all_records[0].keys())
             writer.writeheader()
             writer.writerows(all_records)
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except KeyboardInterrupt:
-        raise SystemExit("\ninterrupted") from None
+    main()

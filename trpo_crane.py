@@ -23,6 +23,7 @@ Along the run the policy narrows, the horizon grows, the critic's step size fall
     python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
 """
 
+import io
 import os
 import signal
 import time
@@ -342,7 +343,6 @@ if __name__ == "__main__":
     run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
     lock = crane_env.lock_folder(run_dir)
     print(f"writing to {run_dir}", flush=True)
-    crane_env.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
     task = {"env_id": args.env_id, **(envs.unwrapped.task if is_crane else {})}
@@ -361,10 +361,12 @@ if __name__ == "__main__":
         state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0
         state["final_scores"] = final_scores
         for name, contents in (("policy", policy), ("checkpoint", policy | state)):
-            with open(run_dir / f"{name}.tmp", "wb") as file:
-                torch.save(contents, file)
+            buffer = io.BytesIO()
+            torch.save(contents, buffer)
+            (run_dir / f"{name}.tmp").write_bytes(buffer.getvalue())
             # a kill or a full disk leaves the old file whole
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
+        crane_env.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
 
     def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
         protocol = {"trials": trials, "seed": args.eval_seed, "env_threads": args.env_threads}

@@ -4,7 +4,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -13,9 +13,9 @@ import sb3_contrib
 import stable_baselines3
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from crane_env import CraneVectorEnv
+from sb3_crane import CraneVecEnv
 
 # of both sides
 SEED = 1
@@ -38,43 +38,6 @@ def with_better_threads(iterations: list[Iteration]) -> list[Iteration]:
     """Those of the number of threads that was faster in the median."""
     groups = {i.threads: [j for j in iterations if j.threads == i.threads] for i in iterations}
     return max(groups.values(), key=lambda group: np.median([i.rate for i in group]))
-
-
-class CranesForSB3(VecEnv):
-    """CraneVectorEnv as SB3 wants it."""
-
-    def __init__(self, frame_skip: int):
-        self.envs = CraneVectorEnv(CRANES, frame_skip=frame_skip, env_threads=THREADS)
-        spaces = self.envs.single_observation_space, self.envs.single_action_space
-        super().__init__(CRANES, *spaces)
-
-    def reset(self) -> np.ndarray:
-        return self.envs.reset(seed=SEED)[0]
-
-    def step_async(self, actions: np.ndarray) -> None:
-        self.actions = actions
-
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
-        obs, reward, terminated, truncated, info = self.envs.step(self.actions)
-        done, infos = terminated | truncated, [{} for _ in range(CRANES)]
-        for i in np.flatnonzero(done):
-            infos[i]["terminal_observation"] = info["final_obs"][i]
-            infos[i]["TimeLimit.truncated"] = bool(truncated[i])
-        return obs, reward, done, infos
-
-    def close(self) -> None:
-        self.envs.close()
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list:
-        return [getattr(self.envs, attr_name)] * CRANES
-
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        return [False] * CRANES
-
-    def _unused(self, *args: Any, **kwargs: Any) -> Any:
-        raise NotImplementedError
-
-    set_attr = env_method = _unused
 
 
 class Stopwatch(BaseCallback):
@@ -117,8 +80,10 @@ def train_sb3(
     makers = [partial(crane, frame_skip)] * n
     if kind == "Subproc":
         envs = SubprocVecEnv(makers, start_method=START)
+    elif kind == "Dummy":
+        envs = DummyVecEnv(makers)
     else:
-        envs = DummyVecEnv(makers) if kind == "Dummy" else CranesForSB3(frame_skip)
+        envs = CraneVecEnv(CRANES, env_threads=THREADS, frame_skip=frame_skip)
     policy = {"net_arch": list(NETWORK), "log_std_init": LOG_STD}
     options = {"n_steps": rollout // n, "batch_size": rollout // MINIBATCHES, "device": "cpu"}
     options |= {"n_epochs": EPOCHS, "policy_kwargs": policy, "seed": SEED}

@@ -1,13 +1,20 @@
 """The environment's contract: spaces, seeds, autoreset, starts, errors."""
 
+import copy
 import inspect
+import os
+import pickle
 import re
+import select
+import signal
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, NormalizeObservation, NormalizeReward
 
 import crane_env
 import eval_crane
@@ -20,9 +27,18 @@ def random_actions(rng, n):
     return rng.uniform(-1, 1, (n, 6))
 
 
+def needs_opengl():
+    try:
+        mujoco.Renderer(crane_env.load_model(), 8, 8).close()
+    except Exception as error:
+        pytest.skip(f"no OpenGL here: {error}")
+
+
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("env_id", ["ForestryCrane-v0", "ForestryCranePaper-v0"])
 def test_check_env(env_id):
-    check_env(gymnasium.make(env_id).unwrapped, skip_render_check=True)
+    needs_opengl()
+    check_env(gymnasium.make(env_id).unwrapped)
 
 
 def test_registered_both_ways():
@@ -525,6 +541,13 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"frame_skp": 5}, "no option 'frame_skp', only frame_skip, contact,"),
         ({"omega2": 1.0}, "no option 'omega2'"),
         ({"diameter": [0.5, 0.5, 0.5]}, "diameter must be one number or 2 numbers"),
+        ({"num_envs": 2.5}, r"num_envs must be a whole number in \[1, 16,384\], got 2.5"),
+        ({"num_envs": np.nan}, "num_envs must be a whole number"),
+        ({"env_threads": -1}, "env_threads must be a whole number"),
+        ({"width": 0}, r"width must be a whole number in \[1, 1,920\], got 0"),
+        ({"height": 1081}, "height must be a whole number"),
+        ({"autoreset_mode": "later"}, "'later' is not a valid AutoresetMode"),
+        ({"autoreset_mode": AutoresetMode.DISABLED}, "must be SAME_STEP or NEXT_STEP"),
     ],
 )
 def test_bad_arguments(kwargs, words):
@@ -554,8 +577,140 @@ def test_bad_calls():
         envs.reset(seed=[1, 2, 3])
     env = CraneEnv()
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="shape"):
+    with pytest.raises(ValueError, match=r"an action must have shape \(6,\), got \(5,\)"):
         env.step(np.zeros(5))
+    with pytest.raises(ValueError, match="one crane has no autoreset_mode"):
+        CraneEnv(autoreset_mode="SameStep")
+
+
+def test_difficulty_is_checked_and_set_from_anywhere():
+    env = gymnasium.make("ForestryCrane-v0", difficulty=0.5)
+    assert env.get_wrapper_attr("difficulty") == env.unwrapped.difficulty == 0.5
+    env.set_wrapper_attr("difficulty", 0.0)
+    _, info = env.reset(seed=0)
+    assert env.unwrapped.envs.difficulty == 0.0 and info["d_combine"] < 1.5
+    cranes = gymnasium.make_vec("ForestryCrane-v0", 2, vectorization_mode="sync")
+    cranes.set_attr("difficulty", [0.25, 0.75])
+    assert cranes.get_attr("difficulty") == (0.25, 0.75)
+    cranes = CraneVectorEnv(2)
+    for values in (0.25, [0.75, 0.75]):
+        cranes.set_attr("difficulty", values)
+        assert cranes.get_attr("difficulty") == (cranes.difficulty,) * 2 == (np.max(values),) * 2
+    with pytest.raises(ValueError, match="all cranes share difficulty"):
+        cranes.set_attr("difficulty", [0.25, 0.75])
+    with pytest.raises(AttributeError, match="no attribute 'dificulty'"):
+        cranes.set_attr("dificulty", 0.5)
+    for holder in (cranes, env.unwrapped):
+        for wrong in (-0.1, 1.5, np.nan, "1"):
+            with pytest.raises(ValueError, match=r"difficulty must be a number in \[0, 1\]"):
+                holder.difficulty = wrong
+
+
+def test_spec_knows_the_length_of_an_episode():
+    for options, steps in [({}, 90), ({"frame_skip": 1}, 1800), ({"frame_skip": 7}, 258)]:
+        env = gymnasium.make("ForestryCrane-v0", **options)
+        assert env.spec.max_episode_steps == steps == env.unwrapped.spec.max_episode_steps
+    assert gymnasium.make("ForestryCranePaper-v0").spec.max_episode_steps == 1800
+    assert gymnasium.make(env.spec).unwrapped.envs.frame_skip == 7
+    assert gymnasium.make_vec("ForestryCrane-v0", num_envs=2).spec.id == "ForestryCrane-v0"
+    assert CraneEnv().spec is None
+
+
+def test_info_has_masks_and_what_sb3_reads(monkeypatch):
+    """Gymnasium's own conversion to one dictionary a crane finds what it looks for."""
+    monkeypatch.setattr(crane_env, "REACH_TIME", 0.5)
+    envs = DictInfoToList(CraneVectorEnv(3))
+    _, infos = envs.reset(seed=0)
+    names = {"d_combine", "clearance", "centre_miss", *crane_env.TERMS}
+    assert all(set(info) == names for info in infos)
+    envs.env.reach_time[1] = 0.1
+    of_ends = {"success", "is_success", *crane_env.CONDITIONS}
+    for _ in range(5):
+        _, _, terminated, _, infos = envs.step(np.zeros((3, 6)))
+    assert terminated.tolist() == [True, False, True]
+    for info, ended in zip(infos, terminated):
+        assert names | {"termination", "time_to_reach"} <= set(info)
+        assert (of_ends | {"final_obs", "final_info"} <= set(info)) == ended
+    env = CraneEnv()
+    _, info = env.reset(seed=0)
+    assert set(info) == names
+    info = env.step(np.zeros(6))[-1]
+    assert set(info) == names | of_ends | {"termination", "time_to_reach"}
+
+
+def test_next_step_autoreset():
+    """As Gymnasium's SyncVectorEnv does it, from the same starts and with the same actions."""
+    ours = CraneVectorEnv(4, autoreset_mode=AutoresetMode.NEXT_STEP)
+    assert ours.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    theirs = SyncVectorEnv([CraneEnv] * 4, autoreset_mode=AutoresetMode.NEXT_STEP)
+    seeds = np.random.SeedSequence(5).spawn(4)
+    obs, _ = ours.reset(seed=seeds)
+    for env, seed, crane in zip(theirs.envs, seeds, obs):  # Gymnasium passes whole numbers only
+        env.envs.reset(seed=[seed])
+        np.testing.assert_array_equal(
+            env.envs.observe(env.envs.state(), np.zeros((1, 6)))[0][0], crane
+        )
+    theirs._autoreset_envs[:] = False  # it has not seen these resets
+    theirs.action_space.seed(0)
+    rng, ends, rests = np.random.default_rng(0), 0, 0
+    for _ in range(150):
+        actions = np.sign(rng.uniform(-1, 1, (4, 6))) * [1, 0, 0, 0, 1, 1]
+        resting = ours.resting.copy()
+        obs, reward, terminated, truncated, info = ours.step(actions)
+        expected = theirs.step(actions.astype(np.float32))
+        for mine, other in zip((obs, reward, terminated, truncated), expected):
+            np.testing.assert_array_equal(mine, other)
+        assert (reward[resting] == 0).all() and np.isinf(info["time_to_reach"][resting]).all()
+        assert (info["termination"][resting] == "none").all() and "final_obs" not in info
+        np.testing.assert_array_equal(info["clearance"], expected[4]["clearance"])
+        ends, rests = ends + terminated.sum() + truncated.sum(), rests + resting.sum()
+    assert ends > 5 and rests == ends - (ours.resting).sum()
+    assert len(ours.recent_success) == ends  # an end counts once
+    ours.reset(seed=0)
+    assert not ours.resting.any()
+
+
+def test_wrappers_that_need_next_step():
+    with pytest.raises(ValueError, match="NEXT_STEP"):
+        NormalizeObservation(CraneVectorEnv(2))
+    envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=2, autoreset_mode="NextStep")
+    envs = NormalizeReward(NormalizeObservation(envs))
+    envs.reset(seed=0)
+    for _ in range(3):
+        obs, *_ = envs.step(np.zeros((2, 6)))
+    assert np.isfinite(obs).all()
+
+
+@pytest.mark.parametrize("copying", [pickle.dumps, copy.copy, copy.deepcopy])
+@pytest.mark.parametrize("make", [CraneEnv, CraneVectorEnv])
+def test_cranes_say_that_they_cannot_be_copied(make, copying):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(TypeError, match="cannot be copied or pickled; make new ones"):
+        copying(env)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.filterwarnings("ignore:.*fork")
+@pytest.mark.parametrize("threads, expected", [(1, b"stepped"), (2, b"make the cranes after the")])
+def test_a_forked_process_does_not_hang(threads, expected):
+    envs = CraneVectorEnv(4, env_threads=threads)
+    envs.reset(seed=0)
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            envs.step(np.zeros((4, 6)))
+            os.write(write, b"stepped")
+        except RuntimeError as error:
+            os.write(write, str(error).encode())
+        os._exit(0)
+    os.close(write)
+    ready, _, _ = select.select([read], [], [], 60)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert ready and os.read(read, 99).startswith(expected)
+    assert envs.step(np.zeros((4, 6)))[0].shape == (4, 18)  # the parent goes on
 
 
 def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
@@ -583,10 +738,7 @@ def test_a_window_needs_a_display(monkeypatch):
 
 
 def test_render():
-    try:
-        mujoco.Renderer(crane_env.load_model(), 8, 8).close()
-    except Exception as error:
-        pytest.skip(f"no OpenGL here: {error}")
+    needs_opengl()
     env = gymnasium.make("ForestryCrane-v0", render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()

@@ -495,19 +495,21 @@ def test_a_stop_during_an_evaluation_keeps_the_update(
 
 
 ONE_DECISION = {
-    "mppo_beta": ("--minibatch-size 1", "no standard deviation"),
+    "mppo_beta": ("--num-envs 1 --num-steps 1025", "no standard deviation"),
     "ppo": ("--num-envs 3 --num-steps 3 --minibatch-size 4", "no standard deviation"),
-    "trpo": ("--num-envs 1 --num-steps 1", "needs 2 decisions in a rollout"),
+    "trpo": ("--num-envs 1 --num-steps 1", "must be at least 2"),
     "recurrent_ppo": ("--num-envs 4 --num-minibatches 4 --num-steps 1", "--num-steps above 1"),
 }
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_clear_errors(tmp_path, run_here, algorithm):
+def test_clear_errors(tmp_path, run_here, capsys, algorithm):
     def error_of(*arguments):
+        """One line, or the words in the box that shows a wrong argument."""
         with pytest.raises(SystemExit) as error:
             run_here(algorithm, *arguments)
-        return str(error.value)
+        box = re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err)
+        return " ".join(box.split()) if error.value.code == 2 else str(error.value)
 
     args = vars(module(algorithm).Args())
     task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_env.DEFAULTS}
@@ -533,14 +535,13 @@ def test_clear_errors(tmp_path, run_here, algorithm):
         ("policy", "it lacks what a checkpoint has, as a policy.pt does"),
         ("old", ""),
         ("text", ""),
-        ("empty", "No such file or directory: 'empty/checkpoint.pt'"),
-        ("nowhere", "No such file or directory: 'nowhere/checkpoint.pt'"),
-        ("text/checkpoint.pt", "Not a directory"),
     ]:
         error = error_of("--resume", name)
-        assert error.startswith(f"--resume: no usable checkpoint.pt in {name}: ")
+        assert error.startswith(f"--resume: {name}/checkpoint.pt is damaged or does not fit: ")
         assert reason in error and "\n" not in error
-    batches = "num-minibatches" if algorithm == "recurrent_ppo" else "minibatch-size"
+    for name in ("empty", "nowhere", "text/checkpoint.pt"):
+        assert error_of("--resume", name) == f"--resume: there is no {name}/checkpoint.pt"
+    batches = "num_minibatches" if algorithm == "recurrent_ppo" else "minibatch_size"
     arguments, message = ONE_DECISION[algorithm]
     assert message in error_of(*arguments.split())
     for arguments, message in [
@@ -548,13 +549,17 @@ def test_clear_errors(tmp_path, run_here, algorithm):
         ("--env-id Pendulum-v77", "Pendulum-v77: "),
         ("--env-id CartPole-v1 --env.retry 0", "CartPole-v1: its observations or actions are no"),
         ("--env-id Pendulum-v1 --env.contact sdf", "Pendulum-v1 is not the crane and has no opti"),
-        ("--env.frame-skip 0", "ForestryCrane-v0: frame_skip must be a whole number in [1, 1800]"),
+        ("--env.frame-skip 0", "ForestryCrane-v0: frame_skip must be a whole number in [1, 1,800]"),
         ("--env.difficulty 2", "ForestryCrane-v0: difficulty must be a number in [0, 1], got 2.0"),
-        *[(f"--{name} 0", "must be at least 1") for name in ("num-envs", "num-steps")],
-        (f"--{batches} 0", "sizes and --eval-trials must be at least 1"),
-        ("--eval-trials 0", "sizes and --eval-trials must be at least 1"),
-        ("--seed -1", "seeds at least 0"),
-        ("--eval-seed -1", "seeds at least 0"),
+        ("--num-steps 1000000000", "num_steps must be a whole number in [1, 16,384], got 1000000"),
+        ("--num-envs 16384 --num-steps 65", "--num-envs times --num-steps must be at most 1,048,"),
+        (f"--{batches} 0", f"{batches} must be a whole number in ["),
+        ("--hidden-sizes 64 0", "hidden_sizes must be a whole number in [1, 16,384], got (64, 0)"),
+        ("--eval-trials 0", "eval_trials must be a whole number in [1, 1,000], got 0"),
+        ("--seed -1", "seed must be a whole number in [0, 4,294,967,295], got -1"),
+        ("--gamma 1.01", "gamma must be a number in [0, 1], got 1.01"),
+        ("--reward-scale nan", "reward_scale must be a number in [0, 1,000,000], got nan"),
+        ("--learning-rate inf", "learning_rate must be a number in [0, 1,000,000], got inf"),
     ]:
         assert message in error_of(*arguments.split())
     assert not (tmp_path / "runs").exists()  # no wrong call leaves a folder

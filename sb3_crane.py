@@ -1,0 +1,79 @@
+"""The cranes as a vectorized environment of Stable-Baselines3 (SB3), for its algorithms.
+
+    pip install stable-baselines3
+
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.vec_env import VecMonitor
+    from sb3_crane import CraneVecEnv
+
+    model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
+    model.learn(100_000)
+    print(crane_env.evaluate(model, "ForestryCrane-v0", trials=100, seed=40_000))
+
+SB3 wraps `gymnasium.make("ForestryCrane-v0")` itself, one crane at a time. This is faster: all
+cranes are simulated together.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+import crane_env
+
+
+class CraneVecEnv(VecEnv):
+    """N cranes of a registered task; env_threads and options are those of `CraneVectorEnv`.
+
+    `infos[i]` is empty until crane i ends an episode. Then it holds all that the crane's `info`
+    holds, with SB3's `is_success`, `terminal_observation` and `TimeLimit.truncated`.
+    """
+
+    def __init__(self, num_envs: int, env_id: str = "ForestryCrane-v0", **options: Any):
+        envs = gymnasium.make_vec(env_id, num_envs, **options)
+        if not isinstance(envs, crane_env.CraneVectorEnv):
+            raise ValueError(f"{env_id} is not the crane; SB3's make_vec_env takes other tasks")
+        self.envs = envs
+        super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        seeds = None if None in self._seeds else self._seeds  # `seed` has given them, once
+        obs, _ = self.envs.reset(seed=seeds)
+        self._reset_seeds()
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
+        obs, reward, terminated, truncated, info = self.envs.step(self.actions)
+        done, infos = terminated | truncated, [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(done):
+            end = info["final_info"].items()
+            infos[i] = {key: values[i] for key, values in end if not key.startswith("_")}
+            infos[i]["terminal_observation"] = info["final_obs"][i]
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+        return obs, reward.astype(np.float32), done, infos
+
+    def get_images(self) -> Sequence[np.ndarray]:
+        return self.envs.render()
+
+    def close(self) -> None:
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        values = self.envs.get_attr(attr_name)
+        return [values[i] for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        if indices is not None:
+            raise ValueError(f"all cranes share {attr_name}")
+        self.envs.set_attr(attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> None:
+        raise NotImplementedError(f"the cranes are one object: call envs.{method_name} instead")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
