@@ -458,8 +458,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if self.autoreset_mode == AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode must be SAME_STEP or NEXT_STEP; `advance` resets none")
         if diameter is not None:
-            d = np.asarray(diameter, float)
-            if d.shape not in [(), (num_envs,)] or not np.all((D_MIN <= d) & (d <= D_MAX)):
+            d = np.asarray(diameter)
+            fits = d.shape in [(), (num_envs,)] and d.dtype.kind in "fiu"
+            if not fits or not np.all((D_MIN <= d) & (d <= D_MAX)):
                 needed = f"one number or {num_envs} numbers in [{D_MIN}, {D_MAX}] m"
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             diameter = np.broadcast_to(d, num_envs)

@@ -36,6 +36,7 @@ import tyro
 
 import crane_env
 import eval_crane
+from crane_env import Seed
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "compare_sb3.csv"
@@ -77,10 +78,13 @@ class Args:
     """Gymnasium tasks"""
     algorithms: tuple[Literal["ppo", "mppo_beta", "trpo"], ...] = ("ppo", "mppo_beta", "trpo")
     """our scripts; SB3 has no Beta policy, and its PPO is the one to compare mppo_beta with"""
-    seeds: tuple[int, ...] = (1, 2, 3)
+    seeds: tuple[Seed, ...] = (1, 2, 3)
     """one run each"""
     results: Path = RESULTS
     """CSV file that gets a row from each run"""
+
+    def __post_init__(self) -> None:
+        crane_env.check(vars(self), Args)
 
 
 def judge(task: str, policy: Any) -> tuple[float, float]:
@@ -195,6 +199,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def main() -> None:
+    crane_env.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     if not args.results.parent.is_dir():
         raise SystemExit(f"--results: no folder {args.results.parent}; make it first")

@@ -19,11 +19,16 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 import gymnasium
 import numpy as np
 import tyro
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.wrappers import TransformObservation
+
+import crane_env
+from crane_env import Count, Seed
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "masked_pendulum.csv"
@@ -49,8 +54,11 @@ gymnasium.register("MaskedPendulum-v1", entry_point=masked_pendulum, max_episode
 
 @dataclass
 class Args:
-    steps: int = 300_000  # decisions of each run, in whole rollouts
-    seeds: tuple[int, ...] = (1, 2, 3)  # one run each of either script
+    steps: Count = 300_000  # decisions of each run, in whole rollouts
+    seeds: tuple[Seed, ...] = (1, 2, 3)  # one run each of either script
+
+    def __post_init__(self) -> None:
+        crane_env.check(vars(self), Args)
 
 
 def train(algorithm: str, seed: int, steps: int) -> list[tuple[int, float]]:
@@ -71,6 +79,7 @@ def train(algorithm: str, seed: int, steps: int) -> list[tuple[int, float]]:
 
 
 if __name__ == "__main__":
+    crane_env.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     rows = list(csv.reader(open(RESULTS)))[1:] if RESULTS.exists() else []
     for seed in args.seeds:

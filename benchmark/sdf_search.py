@@ -93,4 +93,5 @@ def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
 
 
 if __name__ == "__main__":
+    crane_env.one_line_errors()
     tyro.cli(main, description=__doc__)

@@ -424,6 +424,7 @@ def ratios(results: Results) -> list[tuple[str, float, float, float]]:
 
 
 def main() -> None:
+    crane_env.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     full = not args.quick and set(args.only) == set(PARTS)
     path = args.csv or (RESULTS if full else None)

@@ -231,6 +231,21 @@ def test_sampling_is_repeatable():
     assert misses[0] != misses[1] and misses[1] == misses[2]
 
 
+def test_stochastic_trials_from_the_command_line(run_here, tmp_path):
+    """They differ from the mean action's. --seed repeats them, whatever torch drew before."""
+
+    def misses(*arguments):
+        torch.rand(len(arguments))
+        line = ("--trials", "2", "--diameters", "0.5", "--pose-noise", "none", "--env-threads", "1")
+        run_here(*line, "--csv", tmp_path / "trials.csv", *arguments)
+        with open(tmp_path / "trials.csv") as file:
+            return [row["centre_miss"] for row in csv.DictReader(file)]
+
+    drawn = misses("--stochastic", "--seed", "3")
+    assert drawn == misses("--stochastic", "--seed", "3")
+    assert set(drawn) & set(misses("--seed", "3")) == set()
+
+
 @pytest.mark.slow
 def test_sdf_trials():
     policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)

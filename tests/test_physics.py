@@ -238,6 +238,22 @@ def test_resting_in_an_end_stop_ends_no_episode():
     assert 0.015 < np.max(beyond) < crane_env.LIMIT_TOLERANCE
 
 
+def test_a_servo_in_its_stop_winds_up_to_its_force_and_no_further():
+    """Slew and boom, five seconds: each integrator's own force is the limit in crane.xml."""
+    q = np.tile(HANGING, (2, 1))
+    q[0, 0], q[1, 1], q[1, 2] = 3.68, 1.46, -0.4
+    q[:, 4] = np.pi / 2 - q[:, 1] - q[:, 2]
+    envs = place(q)
+    for _ in range(50):
+        envs.advance(np.eye(6)[:2])
+    limits = [200_000, 400_000]  # N m, of q1 and q2
+    for crane, limit in enumerate(limits):
+        lead = envs.act[crane, crane] - envs.qpos[crane, crane]
+        stiffness = envs.model.actuator_gainprm[8 + crane, 0]
+        within_25_ms = crane_env.SPEEDS["real"][1, crane] * 0.025  # between two clamps
+        assert 0.98 * limit < stiffness * lead < limit + 1.02 * stiffness * within_25_ms
+
+
 def test_synchronised_pairs_stay_together():
     """Within 2 cm and 0.05 rad, through reversals at full speed."""
     envs = place(HANGING)

@@ -215,12 +215,32 @@ def test_values_of_what_follows_a_rollout(run_here, algorithm):
 
 
 @pytest.mark.parametrize("algorithm", ["mppo_beta", "ppo", "recurrent_ppo"])
-def test_ratio_is_one_on_the_first_minibatch(tmp_path, run_here, algorithm):
-    run_here(algorithm, *one_minibatch(algorithm), "--eval-every", "0")
+def test_ratio_is_one_in_every_update_of_one_minibatch(tmp_path, run_here, algorithm):
+    """On Recall, whose episodes of 5 steps cross the ends of rollouts of 6: memories go on."""
+    task = "--env-id recall_env:Recall-v0 --env.retry 0 --num-steps 6 --learning-rate 0.01"
+    arguments = [*small(algorithm), *task.split(), "--update-epochs", "1", "--eval-every", "0"]
+    arguments += ["--num-minibatches", "1"] if algorithm == "recurrent_ppo" else []
+    run_here(algorithm, *arguments, "--total-timesteps", "240")
     values = scalars(only_run(tmp_path))
-    assert abs(values["losses/old_approx_kl"][0]) < 1e-6
-    assert abs(values["losses/approx_kl"][0]) < 1e-6
-    assert values["losses/clipfrac"][0] == 0
+    assert len(values["losses/approx_kl"]) == 10
+    np.testing.assert_allclose(values["losses/approx_kl"], 0, atol=1e-6)
+    np.testing.assert_allclose(values["losses/old_approx_kl"], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", ["mppo_beta", "ppo", "recurrent_ppo"])
+def test_an_update_stops_after_the_first_epoch_beyond_target_kl(tmp_path, run_here, algorithm):
+    """Two minibatches an epoch: 5 epochs without a bound, 1 with one that none can keep."""
+    arguments = "--env-id recall_env:Recall-v0 --env.retry 0 --eval-every 0 --update-epochs 5"
+    arguments = [*small(algorithm), *arguments.split(), "--learning-rate", "0.01"]
+    arguments += ["--total-timesteps", "64"]
+    for bound, epochs in [("None", 5), ("1e-9", 1), ("1000", 5)]:
+        folder = tmp_path / bound
+        folder.mkdir()
+        left = run_here(algorithm, *arguments, "--target-kl", bound, cwd=folder)
+        assert len(left["stats"]["losses/approx_kl"]) == 2 * epochs
+        checkpoint = torch.load(only_run(folder) / "checkpoint.pt", weights_only=True)
+        steps = {state["step"].item() for state in checkpoint["optimizer"]["state"].values()}
+        assert steps == {2.0 * epochs}
 
 
 KEYS = """

@@ -1,0 +1,228 @@
+"""Whether the tests notice wrong code: each mutation below must make one of its tests fail.
+
+    python tests/mutations.py          # some ten minutes on two cores
+    python tests/mutations.py judge    # those whose name contains "judge"
+
+Each works on a copy of the repository in a temporary folder.
+"""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parent.parent
+SCRIPTS = ("mppo_beta_crane.py", "ppo_crane.py", "trpo_crane.py", "recurrent_ppo_crane.py")
+PPOS = tuple(script for script in SCRIPTS if script != "trpo_crane.py")
+
+
+class Mutation(NamedTuple):
+    name: str
+    files: tuple[str, ...]  # one run of the tests for each
+    right: str
+    wrong: str
+    tests: str  # files of tests/ and words for `pytest -k`
+
+
+MUTATIONS = [
+    Mutation(
+        "the judge takes a trial's last end",
+        ("crane_env.py",),
+        "first = (terminated | truncated) & ~ended",
+        "first = terminated | truncated",
+        "test_trials",
+    ),
+    Mutation(
+        "success counts after an episode's end",
+        ("crane_env.py",),
+        "np.zeros_like(info[name]))[first] = info[name][first]",
+        "np.zeros_like(info[name]))[:] = info[name]",
+        "test_trials",
+    ),
+    Mutation(
+        "returns count after an episode's end",
+        ("crane_env.py",),
+        "np.zeros_like(info[name]))[first] = info[name][first]",
+        "np.zeros_like(info[name]))[mine := first if name != 'episodic_return' else terminated"
+        " | truncated] = info[name][mine]",
+        "test_trials",
+    ),
+    Mutation(
+        "the judge and evaluate() disagree",
+        ("crane_env.py",),
+        "diameters, seeds = monte_carlo_trials(seed, trials)",
+        "diameters, seeds = monte_carlo_trials(seed + 1, trials)",
+        "test_trials",
+    ),
+    Mutation(
+        "the judge's --stochastic is not seeded",
+        ("eval_crane.py",),
+        '        torch.manual_seed(args.seed)\n        options["pose_noise"] = noise',
+        '        options["pose_noise"] = noise',
+        "test_eval",
+    ),
+    Mutation(
+        "the judge ignores --stochastic",
+        ("eval_crane.py",),
+        "seeds[chunk], not args.stochastic)",
+        "seeds[chunk], True)",
+        "test_eval",
+    ),
+    Mutation(
+        "the judge ignores --contact",
+        ("eval_crane.py",),
+        'options |= {"contact": args.contact} if args.contact else {}',
+        "",
+        "test_eval",
+    ),
+    Mutation(
+        "code in a policy or checkpoint runs",
+        ("eval_crane.py", *SCRIPTS),
+        "weights_only=True",
+        "weights_only=False",
+        "test_failures -k code",
+    ),
+    Mutation(
+        "the update starts from empty memories",
+        ("recurrent_ppo_crane.py",),
+        "mb_state = (first_state[0][mb], first_state[1][mb])",
+        "mb_state = agent.initial_state(len(mb))",
+        "test_scripts -k ratio",
+    ),
+    Mutation(
+        "V(final_obs) without memory",
+        ("recurrent_ppo_crane.py",),
+        "cut_state = torch.zeros_like(final_obs[..., 0]), [h[cut] for h in state]",
+        "cut_state = torch.zeros_like(final_obs[..., 0]), agent.initial_state(int(cut.sum()))",
+        "test_scripts -k follows",
+    ),
+    Mutation(
+        "bootstrapping from the next episode's start",
+        SCRIPTS,
+        'to_tensor(np.stack(info["final_obs"][cut]))',
+        "next_obs[cut]",
+        "test_scripts -k follows",
+    ),
+    Mutation(
+        "no bootstrapping at the time limit",
+        SCRIPTS,
+        "if cut.any():",
+        "if False:",
+        "test_scripts -k follows",
+    ),
+    Mutation(
+        "a checkpoint forgets the difficulty",
+        SCRIPTS,
+        'state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0',
+        'state["difficulty"] = 1.0',
+        "test_scripts -k curriculum",
+    ),
+    Mutation(
+        "resume forgets the difficulty",
+        SCRIPTS,
+        'envs.unwrapped.difficulty = checkpoint["difficulty"]',
+        "pass",
+        "test_scripts -k curriculum",
+    ),
+    Mutation(
+        "the anti-windup bound is three times too wide",
+        ("crane_env.py",),
+        "self.max_lead = self.model",
+        "self.max_lead = 3 * self.model",
+        "test_physics -k stop",
+    ),
+    Mutation(
+        "a log reached after 6 s counts",
+        ("crane_env.py",),
+        "& (time < REACH_TIME + 1e-9)",
+        "",
+        "test_rules",
+    ),
+    Mutation(
+        "no early stop at target_kl",
+        PPOS,
+        "np.mean(epoch_kls) > args.target_kl",
+        "False",
+        "test_scripts -k target_kl",
+    ),
+    Mutation(
+        "weights that are not finite are saved",
+        SCRIPTS,
+        "if wrong or not all(tensor.isfinite().all() for tensor in agent.state_dict().values()):",
+        "if wrong:",
+        "test_failures -k finite",
+    ),
+    Mutation(
+        "resume ignores changed arguments",
+        SCRIPTS,
+        "and name not in CHANGEABLE",
+        "and False",
+        "test_failures -k refuses",
+    ),
+    Mutation(
+        "the final trials are written twice",
+        SCRIPTS,
+        "if args.final_trials and not final_scores:",
+        "if args.final_trials:",
+        "test_failures -k finished",
+    ),
+    Mutation(
+        "two resumes of one run",
+        ("crane_env.py",),
+        "        lock.acquire()\n",
+        "        pass\n",
+        "test_failures -k second",
+    ),
+    Mutation(
+        "a checkpoint is written in place",
+        SCRIPTS,
+        '(run_dir / f"{name}.tmp").write_bytes(buffer.getvalue())',
+        '(run_dir / f"{name}.pt").write_bytes(buffer.getvalue()[:99])',
+        "test_failures -k full",
+    ),
+    Mutation(
+        "a number's range is not checked",
+        ("crane_env.py",),
+        "isinstance(item, types) and low <= item <= high for item in items",
+        "isinstance(item, types) for item in items",
+        "test_failures -k range",
+    ),
+    Mutation(
+        "NEXT_STEP counts an end twice",
+        ("crane_env.py",),
+        'ending[self.resting] = "none"',
+        "pass",
+        "test_env -k next_step",
+    ),
+]
+
+
+def survivors(mutation: Mutation, file: str) -> str:
+    """The mutation's name if no test fails, else an empty string."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "copy")
+        left_out = shutil.ignore_patterns(".*", "runs", "__pycache__", "docs")
+        shutil.copytree(ROOT, copy, ignore=left_out)
+        code = (copy / file).read_text()
+        if mutation.right not in code:
+            return f"{mutation.name}: {file} has no such line"
+        (copy / file).write_text(code.replace(mutation.right, mutation.wrong))
+        tests, *words = mutation.tests.split(" -k ")
+        line = [sys.executable, "-m", "pytest", "-x", "-q", f"tests/{tests}.py"]
+        line += ["-k", words[0]] if words else []
+        result = subprocess.run(line, cwd=copy, capture_output=True, text=True)
+    caught = result.returncode == 1
+    print("caught  " if caught else "MISSED  ", f"{mutation.name} ({file})", flush=True)
+    return "" if caught else f"{mutation.name} ({file})"
+
+
+if __name__ == "__main__":
+    words = " ".join(sys.argv[1:])
+    jobs = [(m, file) for m in MUTATIONS for file in m.files if words in m.name]
+    with ThreadPoolExecutor(2) as pool:
+        missed = [name for name in pool.map(lambda job: survivors(*job), jobs) if name]
+    print(f"{len(jobs) - len(missed)} of {len(jobs)} mutations caught")
+    sys.exit("\n".join(missed) if missed else 0)
