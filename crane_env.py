@@ -48,7 +48,7 @@ direction. 0 stops the joint; values outside the box are clipped.
 | 5     | q8 jaws          | 1    | -1  | 1    | -1.8, 1.8 rad/s           | -3, 3         |
 """
 
-import contextlib
+import ctypes
 import ctypes.util
 import importlib
 import os
@@ -64,12 +64,14 @@ from typing import (
     Any,
     Literal,
     NamedTuple,
+    TextIO,
     TypedDict,
     Unpack,
     get_args,
     get_origin,
     get_type_hints,
 )
+from weakref import WeakSet
 
 if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco chooses its OpenGL when it is imported
@@ -138,6 +140,8 @@ TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reac
 CONDITIONS = ["not_reached", "not_lifted", "not_held", "off_centre"]
 RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss", *CONDITIONS}
 Array = np.ndarray
+ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()
+LOCKS: list[FileLock] = []  # of the folders in which this process trains
 
 
 # ---- options
@@ -151,6 +155,8 @@ class Range(NamedTuple):
 
 
 Size = Annotated[int, Range(1, 16_384)]
+Width = Annotated[int, Range(1, 4096)]
+Times = Annotated[int, Range(1, 1000)]
 Count = Annotated[int, Range(1, 10**10)]
 Threads = Annotated[int, Range(0, 256)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
@@ -446,24 +452,29 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         camera: Literal["overview", "side", "grapple"] = "overview",
         width: Annotated[int, Range(1, 1920)] = 640,
         height: Annotated[int, Range(1, 1080)] = 480,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,  # or NEXT_STEP
+        autoreset_mode: Literal["SameStep", "NextStep"] = "SameStep",  # or Gymnasium's enum
         **options: Unpack[Options],
     ):
-        given = {"num_envs": num_envs, "env_threads": env_threads, "render_mode": render_mode}
-        given |= {"camera": camera, "width": width, "height": height}
+        given = {
+            "num_envs": num_envs,
+            "env_threads": env_threads,
+            "render_mode": render_mode,
+            "camera": camera,
+            "width": width,
+            "height": height,
+            "autoreset_mode": getattr(autoreset_mode, "value", autoreset_mode),
+        }
         check(given, CraneVectorEnv.__init__)
         if render_mode == "human" and HEADLESS:  # the window's library would end the process
             raise RuntimeError("render_mode 'human' needs a display, and DISPLAY is not set")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        if self.autoreset_mode == AutoresetMode.DISABLED:
-            raise ValueError("autoreset_mode must be SAME_STEP or NEXT_STEP; `advance` resets none")
         if diameter is not None:
             d = np.asarray(diameter)
             fits = d.shape in [(), (num_envs,)] and d.dtype.kind in "fiu"
             if not fits or not np.all((D_MIN <= d) & (d <= D_MAX)):
                 needed = f"one number or {num_envs} numbers in [{D_MIN}, {D_MAX}] m"
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
-            diameter = np.broadcast_to(d, num_envs)
+            diameter = np.broadcast_to(d.astype(float), num_envs)
         self.options = options = complete(options)
         self.task = {"revision": REVISION, **options}  # what a trained policy knows of it
         self.num_envs, self.fixed_diameter = int(num_envs), diameter
@@ -481,6 +492,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         engine = options["contact"], options["integrator"], options["solver"]
         self.model = load_model(*engine, visual=render_mode is not None)
         self.batch = batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
+        ALIVE.add(self)
         for field in ("geom_size", "body_mass", "body_inertia"):
             batch.expand(field)  # each crane has a log of its own
         # live views of the engine's arrays, one row a crane
@@ -539,7 +551,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= {f"_{key}": done if key in of_ends else everywhere for key in info}
         again = done
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            again, self.resting = self.resting, done
+            again, self.resting = self.resting, done.copy()
         elif done.any():
             info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
@@ -702,12 +714,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return np.clip(obs, space.low, space.high).astype(np.float32, order="C"), info
 
     def stay_in_process(self) -> None:
-        """RuntimeError in a forked process, where waiting for the threads would never end."""
+        """RuntimeError in a forked process, which has none of the threads."""
         if os.getpid() != self.process and self.batch.nthread > 1:
             raise RuntimeError("make the cranes after the fork, or with env_threads=1")
 
     def __reduce__(self) -> None:
-        raise TypeError("cranes cannot be copied or pickled; make new ones, as AsyncVectorEnv does")
+        raise TypeError("cranes cannot be copied or pickled; make new ones")
 
     @property
     def difficulty(self) -> float:
@@ -761,6 +773,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.viewer = None
 
 
+def outlive_fork() -> None:
+    """Keep all cranes alive in a forked process: their end would wait for threads for ever."""
+    for envs in ALIVE:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(envs.batch))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=outlive_fork)
+
+
 class CraneEnv(gymnasium.Env):
     """One crane: a thin view of `CraneVectorEnv`, whose arguments it takes except num_envs."""
 
@@ -805,7 +827,8 @@ class CraneEnv(gymnasium.Env):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        # the registered task cannot have this length, which depends on frame_skip
+        # The registered task cannot have this length: it depends on frame_skip. For the same
+        # reason a make() from this spec with another frame_skip needs max_episode_steps=-1.
         self._spec = spec and replace(spec, max_episode_steps=self.envs.max_decisions)
 
     def render(self) -> Array | None:
@@ -831,33 +854,40 @@ def one_line_errors(hint: str = "") -> None:
     """
 
     def report(kind: type, error: BaseException, trace: TracebackType | None) -> None:
-        if not issubclass(kind, (OSError, KeyboardInterrupt)):
-            return sys.__excepthook__(kind, error, trace)
-        interrupted = issubclass(kind, KeyboardInterrupt)
-        line = "interrupted" if interrupted else f"{kind.__name__}: {error}{hint}"
-        with contextlib.suppress(OSError):
-            print(f"\n{line}", file=sys.stderr, flush=True)
-        if issubclass(kind, BrokenPipeError):  # Python must not write what is left into the pipe
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, sys.stdout.fileno())
-            os.dup2(nowhere, sys.stderr.fileno())
+        if issubclass(kind, KeyboardInterrupt):
+            say("\ninterrupted", sys.stderr)
+        elif issubclass(kind, OSError):
+            say(f"\n{kind.__name__}: {error}{hint}", sys.stderr)
+        else:
+            sys.__excepthook__(kind, error, trace)
+        if issubclass(kind, BrokenPipeError):
+            say("", sys.stdout)
 
-    sys.excepthook = report
-    # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
-    threading.excepthook = lambda args: (
-        None if issubclass(args.exc_type, OSError) else sys.__excepthook__(*args[:3])
-    )
+    def report_of_thread(args: threading.ExceptHookArgs) -> None:
+        # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
+        if not issubclass(args.exc_type, OSError):
+            threading.__excepthook__(args)
+
+    sys.excepthook, threading.excepthook = report, report_of_thread
 
 
-def lock_folder(folder: Path) -> FileLock:
-    """Make a run's folder and hold its lock while the process lives. SystemExit if another does."""
+def say(line: str, stream: TextIO = sys.stdout) -> None:
+    """Print a line, unless the terminal or the pipe is closed. Then nothing more goes there."""
+    try:
+        print(line, file=stream, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def lock_folder(folder: Path) -> None:
+    """Make a run's folder and hold its lock until the process ends. SystemExit if another does."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / "lock", blocking=False)
     try:
         lock.acquire()
     except Timeout:
         raise SystemExit(f"another process trains in {folder}") from None
-    return lock
+    LOCKS.append(lock)
 
 
 def is_crane(env_id: str) -> bool:

@@ -303,8 +303,8 @@ def show(policy: Any, env_id: str, options: dict, args: Args) -> None:
     crane.close()
 
 
-def check(args: Args) -> None:
-    """SystemExit that names a wrong argument and its mend."""
+def check_combinations(args: Args) -> None:
+    """SystemExit that names arguments that do not fit together or a file that cannot be written."""
     from_file, wrong_use = args.policy == "file", "goes with --policy file only"
     for wrong, message in [
         (not args.diameters, "--diameters needs at least one number"),
@@ -344,7 +344,7 @@ def check(args: Args) -> None:
 def main() -> None:
     crane_env.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
-    check(args)
+    check_combinations(args)
     task = {"env_id": "ForestryCrane-v0"}
     if args.policy == "file":
         policy, task, name = load_policy(args.path)
@@ -370,6 +370,11 @@ def main() -> None:
         records = judge(policy, env_id, options, args)
         cells = summarize(records)
         all_records += [{"pose_noise": noise, **record} for record in records]
+        if args.csv:
+            with whole_file(args.csv) as path, open(path, "w", newline="") as file:
+                writer = csv.DictWriter(file, all_records[0].keys())
+                writer.writeheader()
+                writer.writerows(all_records)
         if args.json:
             mean = sum(cell["successes"] for cell in cells) / len(records)
             answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
@@ -379,11 +384,6 @@ def main() -> None:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
             print_table(records, cells, noise, f"{TITLES[noise]}: {what}, seed {args.seed}")
     sys.stdout.flush()
-    if args.csv:
-        with whole_file(args.csv) as path, open(path, "w", newline="") as file:
-            writer = csv.DictWriter(file, all_records[0].keys())
-            writer.writeheader()
-            writer.writerows(all_records)
 
 
 if __name__ == "__main__":

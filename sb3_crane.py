@@ -2,9 +2,10 @@
 
     pip install stable-baselines3
 
+    import crane_env
+    from sb3_crane import CraneVecEnv
     from stable_baselines3 import SAC
     from stable_baselines3.common.vec_env import VecMonitor
-    from sb3_crane import CraneVecEnv
 
     model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
     model.learn(100_000)
@@ -19,6 +20,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 import crane_env
@@ -32,9 +34,10 @@ class CraneVecEnv(VecEnv):
     """
 
     def __init__(self, num_envs: int, env_id: str = "ForestryCrane-v0", **options: Any):
-        envs = gymnasium.make_vec(env_id, num_envs, **options)
-        if not isinstance(envs, crane_env.CraneVectorEnv):
+        if not crane_env.is_crane(env_id):
             raise ValueError(f"{env_id} is not the crane; SB3's make_vec_env takes other tasks")
+        mode = AutoresetMode.SAME_STEP  # as SB3 expects it
+        envs = gymnasium.make_vec(env_id, num_envs, autoreset_mode=mode, **options)
         self.envs = envs
         super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
 

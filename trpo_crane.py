@@ -47,11 +47,11 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import crane_env
-from crane_env import Count, Exponent, Factor, Range, Seed, Share, Size, Threads
+from crane_env import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
 
 ALGORITHM = "trpo"
 MAX_BATCH = 2**20  # decisions of a rollout, all in memory
-CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads"}
+CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads", "env"}
 SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
 
 
@@ -74,7 +74,7 @@ class Args:
 
     # algorithm
     num_steps: Size = 64  # decisions per crane and rollout
-    hidden_sizes: tuple[Size, ...] = (256, 256)  # hidden layers of the actor and of the critic
+    hidden_sizes: tuple[Width, ...] = (256, 256)  # hidden layers of the actor and of the critic
     normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: Factor = 1e-3  # Adam's step size at the start, for the critic
     gamma: Share = 0.97  # discount per 0.1 s at the start
@@ -82,12 +82,12 @@ class Args:
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: Count = 1024  # decisions per gradient step of the critic
-    update_epochs: Size = 8  # passes of the critic over each rollout
+    update_epochs: Times = 8  # passes of the critic over each rollout
     max_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
-    cg_iterations: Size = 15  # iterations of the conjugate gradient
+    cg_iterations: Times = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
     fisher_samples: Count = 1024  # decisions of each rollout on which F x = g is solved
-    line_search_steps: Size = 10  # most trials of the line search
+    line_search_steps: Times = 10  # most trials of the line search
     line_search_decay: Annotated[float, Range(0.01, 0.99)] = 0.8  # c, from one trial to the next
     max_grad_norm: Factor = 0.5  # bound of the norm of the critic's gradient
     log_std_init: Exponent = -1.2  # log sigma at the start [action units]
@@ -95,7 +95,7 @@ class Args:
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
-    eval_trials: Annotated[int, Range(1, 1000)] = 20  # trials per log diameter in each evaluation
+    eval_trials: Times = 20  # trials per log diameter in each evaluation
     final_trials: Annotated[int, Range(0, 1000)] = 100  # the same after the training, 0 for none
     eval_seed: Seed = 10_000  # seed of all trials
 
@@ -273,6 +273,7 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
     path = folder / "checkpoint.pt"
     if not path.is_file():
         raise SystemExit(f"--resume: there is no {path}")
+    crane_env.lock_folder(folder)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         task, algorithm = checkpoint["task"], checkpoint["algorithm"]
@@ -283,13 +284,15 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
             raise ValueError("it lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since
         options = {name: task[name] for name in crane_env.DEFAULTS if name in task}
+        options = checkpoint["args"]["env"] | options
         saved = Args(**checkpoint["args"] | {"env": options})
     except Exception as error:  # a damaged file raises many kinds
         reason = str(error).partition("\n")[0]
         raise SystemExit(f"--resume: {path} is damaged or does not fit: {reason}") from None
     args = tyro.cli(Args, default=saved)
-    for name, value in vars(saved).items():
-        if value != getattr(args, name) and name not in CHANGEABLE:
+    given = vars(args) | args.env
+    for name, value in (vars(saved) | options).items():
+        if value != given[name] and name not in CHANGEABLE:
             raise SystemExit(f"--resume: this run has {name} {value}; leave the argument out")
     return checkpoint, args
 
@@ -307,6 +310,8 @@ if __name__ == "__main__":
     if batch_size > MAX_BATCH:
         raise SystemExit(f"--num-envs times --num-steps must be at most {MAX_BATCH:,}")
     num_iterations = max(1, args.total_timesteps // batch_size)
+    if checkpoint is not None and checkpoint["iteration"] > num_iterations:
+        raise SystemExit("--resume: more --total-timesteps than these are done already")
     if batch_size < 2:
         raise SystemExit("--num-envs times --num-steps must be at least 2")
 
@@ -341,7 +346,8 @@ if __name__ == "__main__":
     # Files
     run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
     run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
-    lock = crane_env.lock_folder(run_dir)
+    if args.resume is None:
+        crane_env.lock_folder(run_dir)
     print(f"writing to {run_dir}", flush=True)
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
@@ -360,12 +366,13 @@ if __name__ == "__main__":
         state = {"weights": weights, "optimizer": optimizer.state_dict(), "iteration": iteration}
         state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0
         state["final_scores"] = final_scores
+        # A kill or a full disk leaves the old files whole.
         for name, contents in (("policy", policy), ("checkpoint", policy | state)):
-            buffer = io.BytesIO()
+            buffer = io.BytesIO()  # torch would turn a full disk into a RuntimeError
             torch.save(contents, buffer)
             (run_dir / f"{name}.tmp").write_bytes(buffer.getvalue())
-            # a kill or a full disk leaves the old file whole
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
+        # from now on an error can say how to go on
         crane_env.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
 
     def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
@@ -394,7 +401,7 @@ if __name__ == "__main__":
             save(iteration)
         if stopping:
             progress.close()
-            print(f"stopped after update {iteration}; go on with --resume {run_dir}")
+            crane_env.say(f"stopped after update {iteration}; go on with --resume {run_dir}")
             raise SystemExit(128 + stop_signals[0])
         progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
@@ -500,7 +507,9 @@ if __name__ == "__main__":
         report = {"charts/updates": iteration} | step_report
         report |= {name: np.mean(values) for name, values in stats.items()}
         report |= crane_env.rollout_report(envs, infos)
-        report["losses/explained_variance"] = 1 - (b_advantages.var() / b_returns.var()).item()
+        report["losses/explained_variance"] = (
+            1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
+        )
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
         report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}

@@ -99,7 +99,7 @@ def kills() -> list[Row]:
         line = command(algorithm, *small(algorithm), *task.split())
         quiet = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         process = subprocess.Popen(line, **quiet)
-        while not list(folder.glob("runs/*/checkpoint.pt")):
+        while process.poll() is None and not list(folder.glob("runs/*/checkpoint.pt")):
             time.sleep(0.01)
         time.sleep(random.uniform(0, 2))
         process.kill()

@@ -21,8 +21,6 @@ def run_here(tmp_path, monkeypatch):
     As `script_runs.run`, without the seconds that a new process takes to import torch.
     """
 
-    lock_folder, locks = crane_env.lock_folder, []
-    monkeypatch.setattr(crane_env, "lock_folder", lambda folder: locks.append(lock_folder(folder)))
     for module in (sys, threading):
         monkeypatch.setattr(module, "excepthook", module.excepthook)  # what scripts set ends here
 
@@ -38,8 +36,8 @@ def run_here(tmp_path, monkeypatch):
             return runpy.run_path(file, run_name="__main__")
         finally:
             torch.set_num_threads(threads)
-            for lock in locks:  # which a script holds until its process ends
-                lock.release()
+            while crane_env.LOCKS:  # which a script holds until its process ends
+                crane_env.LOCKS.pop().release()
             for signum, handler in handlers.items():
                 signal.signal(signum, handler)
 

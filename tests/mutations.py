@@ -200,6 +200,14 @@ MUTATIONS = [
 ]
 
 
+def run_tests(folder: Path, tests: str) -> int:
+    """Exit status of pytest: 0 if all pass, 1 if some fail."""
+    name, *words = tests.split(" -k ")
+    line = [sys.executable, "-m", "pytest", "-x", "-q", f"tests/{name}.py"]
+    line += ["-k", words[0]] if words else []
+    return subprocess.run(line, cwd=folder, capture_output=True).returncode
+
+
 def survivors(mutation: Mutation, file: str) -> str:
     """The mutation's name if no test fails, else an empty string."""
     with tempfile.TemporaryDirectory() as folder:
@@ -207,20 +215,17 @@ def survivors(mutation: Mutation, file: str) -> str:
         left_out = shutil.ignore_patterns(".*", "runs", "__pycache__", "docs")
         shutil.copytree(ROOT, copy, ignore=left_out)
         code = (copy / file).read_text()
-        if mutation.right not in code:
-            return f"{mutation.name}: {file} has no such line"
         (copy / file).write_text(code.replace(mutation.right, mutation.wrong))
-        tests, *words = mutation.tests.split(" -k ")
-        line = [sys.executable, "-m", "pytest", "-x", "-q", f"tests/{tests}.py"]
-        line += ["-k", words[0]] if words else []
-        result = subprocess.run(line, cwd=copy, capture_output=True, text=True)
-    caught = result.returncode == 1
+        caught = mutation.right in code and run_tests(copy, mutation.tests) == 1
     print("caught  " if caught else "MISSED  ", f"{mutation.name} ({file})", flush=True)
     return "" if caught else f"{mutation.name} ({file})"
 
 
 if __name__ == "__main__":
     words = " ".join(sys.argv[1:])
+    for tests in sorted({m.tests for m in MUTATIONS if words in m.name}):
+        if run_tests(ROOT, tests) != 0:
+            sys.exit(f"{tests} fails without any mutation")
     jobs = [(m, file) for m in MUTATIONS for file in m.files if words in m.name]
     with ThreadPoolExecutor(2) as pool:
         missed = [name for name in pool.map(lambda job: survivors(*job), jobs) if name]

@@ -3,9 +3,11 @@
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,7 +67,7 @@ def spoil(monkeypatch, update, kind):
 
     def spoiled(self, *args):
         count.append(1)
-        weight = self.param_groups[0]["params"][0]
+        weight = self.param_groups[0]["params"][-1]
         if kind == "gradient" and len(count) >= update:
             weight.grad[:] = torch.nan
         step(self, *args)
@@ -119,10 +121,15 @@ def test_a_reward_that_is_not_finite_ends_the_run(tmp_path, run_here, monkeypatc
 
 
 def ended(line, cwd, **how):
-    """Exit status and standard error, without the progress bar, of a command."""
+    """Exit status and messages of a command."""
     result = subprocess.run(line, cwd=cwd, env=environment(), capture_output=True, text=True, **how)
-    lines = re.split("[\r\n]+", result.stderr)
-    return result.returncode, [text for text in lines if text.strip() and "/s" not in text]
+    return result.returncode, messages(result.stderr)
+
+
+def messages(errors):
+    """Lines of standard error without progress bars."""
+    lines = re.split("[\r\n]+", errors)
+    return [text for text in lines if text.strip() and not re.search(r"%\||\[\d\d:\d\d", text)]
 
 
 LONG = [*ECHO, "--eval-every", "0", "--total-timesteps", "640000"]
@@ -158,17 +165,44 @@ def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_afterwards(
     assert scalars(run_dir)["charts/updates"] == list(range(1, before + 21))
 
 
-def test_a_run_whose_folder_vanishes_ends_in_one_line(tmp_path, run_here, monkeypatch):
-    saved = []
+def begun(algorithm, cwd, *arguments, **how):
+    """A run that has saved its first checkpoint, and its folder."""
+    line = command(algorithm, *small(algorithm), *LONG, *arguments)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | how
+    process = subprocess.Popen(line, cwd=cwd, env=environment(), **pipes)
+    while not list(Path(cwd).glob("runs/*/checkpoint.pt")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    return process, only_run(cwd)
 
-    def vanish(path, *args):
-        saved.append(path)
-        raise FileNotFoundError(2, "No such file or directory", str(path))
 
-    monkeypatch.setattr(os, "replace", vanish)
-    with pytest.raises(FileNotFoundError):
-        run_here("ppo", *small("ppo"), *ECHO, "--eval-every", "0", "--total-timesteps", "64")
-    assert len(saved) == 1
+@pytest.mark.slow
+def test_a_run_whose_folder_vanishes_ends_in_one_line(tmp_path):
+    process, run_dir = begun("ppo", tmp_path)
+    shutil.rmtree(run_dir, ignore_errors=True)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and len(messages(errors)) == 1
+    assert messages(errors)[0].startswith("FileNotFoundError: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signum, code", [(signal.SIGHUP, 129), (signal.SIGTERM, 143)])
+def test_a_closed_terminal_changes_no_exit_status(tmp_path, signum, code):
+    """Nothing can be printed any more. The update is saved."""
+    master, terminal = os.openpty()
+    streams = {"stdin": terminal, "stdout": terminal, "stderr": terminal, "start_new_session": True}
+
+    def default_handlers():
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(each, signal.SIG_DFL)
+
+    process, run_dir = begun("ppo", tmp_path, preexec_fn=default_handlers, **streams)
+    before = torch.load(run_dir / "checkpoint.pt", weights_only=True)["iteration"]
+    os.close(terminal)
+    os.close(master)
+    process.send_signal(signum)
+    assert process.wait(timeout=120) == code
+    assert torch.load(run_dir / "checkpoint.pt", weights_only=True)["iteration"] >= before
 
 
 @pytest.mark.parametrize(
@@ -197,15 +231,19 @@ def test_a_closed_pipe_ends_the_judge_in_one_line(tmp_path):
         "-c",
         "import eval_crane, sys; sys.argv = ['eval_crane.py', '--policy',",
     ]
-    line[-1] += "'zero', '--trials', '1', '--diameters', '0.5']; eval_crane.main()"
+    line[-1] += (
+        "'zero', '--trials', '1', '--diameters', '0.5', '--csv', 'trials.csv']; eval_crane.main()"
+    )
     reader, writer = os.pipe()
     os.close(reader)
     here = {**os.environ, "PYTHONPATH": str(Path(eval_crane.__file__).parent)}
-    result = subprocess.run(line, stdout=writer, stderr=subprocess.PIPE, text=True, env=here)
+    result = subprocess.run(
+        line, stdout=writer, stderr=subprocess.PIPE, text=True, env=here, cwd=tmp_path
+    )
     os.close(writer)
-    lines = [text for text in re.split("[\r\n]+", result.stderr) if text.strip()]
-    assert lines[-1] == "BrokenPipeError: [Errno 32] Broken pipe"
-    assert result.returncode == 1 and "Traceback" not in result.stderr
+    assert messages(result.stderr) == ["BrokenPipeError: [Errno 32] Broken pipe"]
+    assert result.returncode == 1
+    assert len((tmp_path / "trials.csv").read_text().splitlines()) == 1 + 1
 
 
 # ---- what comes from a file is data, never code
@@ -261,6 +299,14 @@ def test_resume_extends_a_run(finished, run_here):
     assert torch.load(run_dir / "checkpoint.pt", weights_only=True)["args"]["resume"] is None
 
 
+def test_resume_cannot_shorten_a_run(finished, run_here):
+    algorithm, run_dir = finished
+    before = {file: file.read_bytes() for file in run_dir.iterdir()}
+    with pytest.raises(SystemExit, match="--resume: more --total-timesteps than these are done"):
+        run_here(algorithm, "--resume", run_dir, "--total-timesteps", "64")
+    assert {file: file.read_bytes() for file in run_dir.iterdir()} == before
+
+
 def test_resume_of_a_finished_run_changes_nothing(finished, run_here, capsys):
     algorithm, run_dir = finished
     before = (run_dir / "checkpoint.pt").read_bytes()
@@ -276,12 +322,14 @@ def test_resume_of_a_finished_run_changes_nothing(finished, run_here, capsys):
 def test_resume_refuses_other_changes_by_name(finished, run_here):
     algorithm, run_dir = finished
     gamma = module(algorithm).Args().gamma
-    run_here(algorithm, "--resume", run_dir, "--gamma", gamma, "--torch-threads", 2)  # no change
+    no_change = ["--gamma", gamma, "--env.retry", 0, "--torch-threads", 2]
+    run_here(algorithm, "--resume", run_dir, *no_change)
     for arguments, said in [
         ("--gamma 0.5", f"this run has gamma {gamma}; leave the argument out"),
         ("--num-envs 8", "this run has num_envs 4"),
         ("--total-timesteps 256 --seed 7", "this run has seed 1"),
         ("--env-id Pendulum-v1", "this run has env_id recall_env:Echo-v0"),
+        ("--env.retry 0.5", "this run has retry 0.0"),
     ]:
         with pytest.raises(SystemExit, match=f"^--resume: {said}"):
             run_here(algorithm, "--resume", run_dir, *arguments.split())
@@ -295,7 +343,7 @@ def test_options_of_the_crane_stay_as_they_were(tmp_path, run_here, monkeypatch)
     monkeypatch.setitem(crane_env.DEFAULTS, "reward", "paper")
     left = run_here("ppo", "--resume", only_run(tmp_path), "--total-timesteps", "128")
     assert left["envs"].unwrapped.options["reward"] == "staged"
-    with pytest.raises(SystemExit, match="--resume: this run has env {'frame_skip': 4,"):
+    with pytest.raises(SystemExit, match="--resume: this run has frame_skip 4; leave"):
         run_here("ppo", "--resume", only_run(tmp_path), "--env.frame-skip", "5")
 
 
@@ -315,10 +363,10 @@ def test_an_argument_added_later_takes_its_default(finished, run_here):
 @pytest.mark.slow
 def test_a_second_resume_of_the_same_run_is_refused(finished, run_here):
     algorithm, run_dir = finished
+    torch.save({}, run_dir / "checkpoint.pt")  # so that nobody can have read it before the lock
     with FileLock(run_dir / "lock"):
         line = command(algorithm, "--resume", run_dir, "--total-timesteps", "6400")
         assert ended(line, run_dir) == (1, [f"another process trains in {run_dir}"])
-    run_here(algorithm, "--resume", run_dir)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -372,6 +420,5 @@ def test_ctrl_c_in_the_judge_is_one_line(tmp_path, job):
         assert process.poll() is None, shown
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    lines = [text for text in re.split("[\r\n]+", errors) if text.strip() and "/s" not in text]
-    assert lines == ["interrupted"] and process.returncode == -signal.SIGINT
+    assert messages(errors) == ["interrupted"] and process.returncode == -signal.SIGINT
     assert not list(tmp_path.iterdir())

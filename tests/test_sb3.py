@@ -60,6 +60,8 @@ def test_attributes_and_options():
     with pytest.raises(ValueError, match="all cranes share difficulty"):
         view.set_attr("difficulty", 1.0, indices=[0])
     assert view.env_is_wrapped(VecMonitor) == [False] * 3
+    with pytest.raises(TypeError, match="autoreset_mode"):
+        CraneVecEnv(2, autoreset_mode="NextStep")
     with pytest.raises(ValueError, match="Pendulum-v1 is not the crane"):
         CraneVecEnv(2, "Pendulum-v1")
 
