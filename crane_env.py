@@ -165,20 +165,24 @@ Factor = Annotated[float, Range(0, 1_000_000)]
 Exponent = Annotated[float, Range(-20, 20)]
 
 
-def check(values: Mapping[str, Any], annotated: Any) -> None:
+def check(values: Mapping[str, Any], *annotated: Any) -> None:
     """ValueError says which of the values its annotation does not allow, and what it allows.
 
-    Checked are bools, Literals and numbers with a Range, also in a tuple or beside None.
+    annotated: classes or functions. Checked are bools, Literals and numbers with a Range, also in
+    a tuple or beside None.
     """
-    annotations = get_type_hints(annotated, include_extras=True)
+    annotations = {}
+    for each in annotated:
+        annotations |= get_type_hints(each, include_extras=True)
     for name, value in values.items():
         if name not in annotations:
-            raise ValueError(f"there is no option {name!r}, only {', '.join(annotations)}")
+            known = ", ".join(each for each in annotations if each not in ("options", "return"))
+            raise ValueError(f"there is no option {name!r}, only {known}")
         kind, items = annotations[name], [value]
         if NoneType in get_args(kind):
             kind, items = get_args(kind)[0], [] if value is None else [value]
         if get_origin(kind) is tuple:
-            kind, items = get_args(kind)[0], value
+            kind, items, name = get_args(kind)[0], value, f"each of {name}"
         limits = getattr(kind, "__metadata__", [None])[0]
         if isinstance(limits, Range):
             (low, high), whole = limits, get_args(kind)[0] is int
@@ -464,7 +468,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "height": height,
             "autoreset_mode": getattr(autoreset_mode, "value", autoreset_mode),
         }
-        check(given, CraneVectorEnv.__init__)
+        check(given | options, CraneVectorEnv.__init__, Options)
         if render_mode == "human" and HEADLESS:  # the window's library would end the process
             raise RuntimeError("render_mode 'human' needs a display, and DISPLAY is not set")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -476,6 +480,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             diameter = np.broadcast_to(d.astype(float), num_envs)
         self.options = options = complete(options)
+        if options["curriculum"] and options["difficulty"] != 1:
+            raise ValueError("curriculum sets the difficulty: leave one of the two out")
         self.task = {"revision": REVISION, **options}  # what a trained policy knows of it
         self.num_envs, self.fixed_diameter = int(num_envs), diameter
         self.process = os.getpid()
@@ -524,6 +530,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
+        if options:
+            raise ValueError(f"reset takes no options, got {options}; see difficulty and diameter")
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self.rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
@@ -736,15 +744,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return (getattr(self, name),) * self.num_envs
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute that all cranes share: one value, or a list of N equal ones."""
+        """Set the difficulty, which all cranes share: one value, or a list of N equal ones."""
         values = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
-        if not hasattr(self, name):
-            raise AttributeError(f"cranes have no attribute {name!r}")
+        if name != "difficulty":
+            raise AttributeError(f"only difficulty can be set, not {name}; make other cranes")
         if values != values[:1] * self.num_envs:
-            raise ValueError(
-                f"all cranes share {name}: give one value or {self.num_envs} equal ones"
-            )
-        setattr(self, name, values[0])
+            raise ValueError("all cranes share difficulty: give one value or N equal ones")
+        self.difficulty = values[0]
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
@@ -801,7 +807,7 @@ class CraneEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
-        obs, info = self.envs.reset(seed=seed)
+        obs, info = self.envs.reset(seed=seed, options=options)
         return obs[0], {key: value[0] for key, value in info.items() if not key.startswith("_")}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -978,7 +984,7 @@ def evaluate(
 ) -> dict[str, float]:
     """Mean return and success rates in trials per diameter (other tasks: trials in all).
 
-    The crane's difficulty, curriculum and retry are ignored: these are trials of the full task.
+    These are trials of the full task. They set diameter, difficulty, curriculum and retry.
     """
     crane = is_crane(env_id)
     if crane:

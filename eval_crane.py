@@ -245,7 +245,8 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path to write to. Once all is written it becomes `path`; of a failure nothing is left."""
+    """A path to write to, which becomes `path` once all is written. An error leaves nothing."""
+    path = path.resolve()
     unfinished = path.with_name(f"unfinished_{path.name}")
     try:
         yield unfinished
@@ -265,7 +266,7 @@ def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
     scene["frame_skip"] = skip // substeps
     frame_every = max(1, round(10 / scene["frame_skip"]))
     fps = round(1 / (frame_every * scene["frame_skip"] * crane_env.TIMESTEP))
-    gif = args.video.suffix == ".gif"
+    gif = args.video.suffix.lower() == ".gif"
     how = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
     frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
@@ -320,7 +321,7 @@ def check_combinations(args: Args) -> None:
             "--video and --viewer judge nothing: --json and --csv have nothing to write",
         ),
         (
-            args.video and args.video.suffix not in (".mp4", ".gif"),
+            args.video and args.video.suffix.lower() not in (".mp4", ".gif"),
             f"--video: {args.video} must end in .mp4 or .gif",
         ),
         (args.width % 2, f"--width must be even, got {args.width}"),
@@ -383,7 +384,7 @@ def main() -> None:
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
             print_table(records, cells, noise, f"{TITLES[noise]}: {what}, seed {args.seed}")
-    sys.stdout.flush()
+    print(end="", flush=True)
 
 
 if __name__ == "__main__":

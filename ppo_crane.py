@@ -197,16 +197,15 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
         task, algorithm = checkpoint["task"], checkpoint["algorithm"]
         revision = task.get("revision", crane_env.REVISION)  # only the crane has one
         if (algorithm, revision) != (ALGORITHM, crane_env.REVISION):
-            raise ValueError(f"it is of {algorithm}, task revision {revision}")
+            raise SystemExit(f"--resume: {path} is of {algorithm}, task revision {revision}")
         if not {"weights", "optimizer", "iteration", "difficulty"} <= checkpoint.keys():
-            raise ValueError("it lacks what a checkpoint has, as a policy.pt does")
+            raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since
         options = {name: task[name] for name in crane_env.DEFAULTS if name in task}
         options = checkpoint["args"]["env"] | options
         saved = Args(**checkpoint["args"] | {"env": options})
-    except Exception as error:  # a damaged file raises many kinds
-        reason = str(error).partition("\n")[0]
-        raise SystemExit(f"--resume: {path} is damaged or does not fit: {reason}") from None
+    except Exception:  # a damaged file raises many kinds
+        raise SystemExit(f"--resume: {path} is damaged or not of this script") from None
     args = tyro.cli(Args, default=saved)
     given = vars(args) | args.env
     for name, value in (vars(saved) | options).items():
@@ -265,7 +264,6 @@ if __name__ == "__main__":
     run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
     if args.resume is None:
         crane_env.lock_folder(run_dir)
-    print(f"writing to {run_dir}", flush=True)
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
     task = {"env_id": args.env_id, **(envs.unwrapped.task if is_crane else {})}
@@ -328,9 +326,11 @@ if __name__ == "__main__":
             signal.signal(signum, signal.SIG_DFL)
 
     signals = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}
-    signals = [s for s in signals if signal.getsignal(s) != signal.SIG_IGN]  # nohup ignores some
-    for signum in signals:
-        signal.signal(signum, stop_after_update)
+    handlers = {signum: signal.getsignal(signum) for signum in signals}
+    for signum, handler in handlers.items():
+        if handler != signal.SIG_IGN:  # nohup ignores some
+            signal.signal(signum, stop_after_update)
+    print(f"writing to {run_dir}", flush=True)
 
     # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
@@ -338,7 +338,7 @@ if __name__ == "__main__":
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     if not remaining:
-        print("all updates are done; a larger --total-timesteps extends the run")
+        print(f"all {num_iterations} updates are done; more --total-timesteps extend the run")
     progress = tqdm(remaining, initial=first_iteration - 1, total=num_iterations)
     for iteration in progress:
         # Schedules
@@ -429,8 +429,8 @@ if __name__ == "__main__":
         finish_update(iteration, report)
 
     print(f"policy saved to {run_dir / 'policy.pt'}", flush=True)
-    for signum in signals:  # all is saved
-        signal.signal(signum, signal.SIG_DFL)
+    for signum, handler in handlers.items():  # all is saved
+        signal.signal(signum, handler)
     if args.final_trials and not final_scores:
         final_scores = evaluate("final", args.final_trials, num_iterations)
         save(num_iterations)

@@ -538,7 +538,9 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"camera": "back"}, "camera"),
         ({"signed_yaw": "yes"}, "signed_yaw must be one of False, True, got 'yes'"),
         ({"axes": "boom"}, "axes must be one of 'crane', 'world'"),
-        ({"frame_skp": 5}, "no option 'frame_skp', only frame_skip, contact,"),
+        ({"frame_skp": 5}, "no option 'frame_skp', only .*frame_skip"),
+        ({"diametr": 0.5}, "no option 'diametr', only .*diameter"),
+        ({"curriculum": True, "difficulty": 0.5}, "curriculum sets the difficulty"),
         ({"omega2": 1.0}, "no option 'omega2'"),
         ({"diameter": [0.5, 0.5, 0.5]}, "diameter must be one number or 2 numbers"),
         ({"num_envs": 2.5}, r"num_envs must be a whole number in \[1, 16,384\], got 2.5"),
@@ -575,6 +577,9 @@ def test_bad_calls():
         envs.step(np.full((2, 6), np.nan))
     with pytest.raises(ValueError, match="seeds"):
         envs.reset(seed=[1, 2, 3])
+    for holder in (envs, CraneEnv()):
+        with pytest.raises(ValueError, match="reset takes no options, got {'reset_mask': 0}"):
+            holder.reset(options={"reset_mask": 0})
     env = CraneEnv()
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"an action must have shape \(6,\), got \(5,\)"):
@@ -598,8 +603,9 @@ def test_difficulty_is_checked_and_set_from_anywhere():
         assert cranes.get_attr("difficulty") == (cranes.difficulty,) * 2 == (np.max(values),) * 2
     with pytest.raises(ValueError, match="all cranes share difficulty"):
         cranes.set_attr("difficulty", [0.25, 0.75])
-    with pytest.raises(AttributeError, match="no attribute 'dificulty'"):
-        cranes.set_attr("dificulty", 0.5)
+    for name in ("dificulty", "frame_skip", "num_envs"):
+        with pytest.raises(AttributeError, match=f"only difficulty can be set, not {name}"):
+            cranes.set_attr(name, 0.5)
     for holder in (cranes, env.unwrapped):
         for wrong in (-0.1, 1.5, np.nan, "1"):
             with pytest.raises(ValueError, match=r"difficulty must be a number in \[0, 1\]"):

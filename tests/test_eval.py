@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from dataclasses import asdict
@@ -325,29 +326,33 @@ def test_video(tmp_path, run_here, monkeypatch, kind):
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
 
-def test_clear_errors(tmp_path, run_here):
+def test_clear_errors(tmp_path, run_here, capsys):
     def error_of(*arguments):
+        """One line, or the words in the box that shows a wrong argument."""
         with pytest.raises(SystemExit) as error:
             run_here(*arguments)
-        return str(error.value)
+        box = re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err)
+        return " ".join(box.split()) if error.value.code == 2 else str(error.value)
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
     assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
     assert "brings its own" in error_of("--no-signed-yaw")
-    assert "--width must be even and lie in" in error_of("--video", "lift.mp4", "--width", "4000")
+    wide = error_of("--video", "lift.mp4", "--width", "4000")
+    assert "width must be a whole number in [64, 1,920], got 4000" in wide
     assert "--width must be even" in error_of("--video", "lift.mp4", "--width", "321")
     assert "either --video or --viewer" in error_of("--video", "lift.mp4", "--viewer")
     assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
-    assert "must lie in [0.3, 0.8]" in error_of("--diameters", "0.2", "--policy", "zero")
-    assert "--trials must be at least 1" in error_of("--trials", "0")
-    assert "--seed must be at least 0" in error_of("--seed", "-1")
-    assert "--env-threads must be at least 0" in error_of("--env-threads", "-1")
+    assert "each of diameters must be a number in [0.3, 0.8]" in error_of("--diameters", "0.2")
+    assert "trials must be a whole number in [1, 10,000], got 0" in error_of("--trials", "0")
+    assert "seed must be a whole number in [0, " in error_of("--seed", "-1")
+    assert "env_threads must be a whole number in [0, 256]" in error_of("--env-threads", "-1")
     assert "PATH goes with" in error_of(tmp_path / "junk.pt", "--policy", "zero")
     assert "--stochastic goes with" in error_of("--policy", "random", "--stochastic")
     assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
-    assert "is a folder" in error_of("--csv", tmp_path)
+    assert "is no file" in error_of("--csv", tmp_path)
+    assert "is no file" in error_of("--csv", "/dev/full")  # renaming would replace it
 
 
 def test_clear_errors_of_damaged_policies(tmp_path, capsys):

@@ -44,9 +44,9 @@ def test_check_reads_annotations():
             crane_env.check({name: value}, Kinds)
     for name, values in bad.items():
         for value in values:
-            with pytest.raises(ValueError, match=f"^{name} must be .*got {re.escape(repr(value))}"):
+            with pytest.raises(ValueError, match=f"{name} must be .*got {re.escape(repr(value))}"):
                 crane_env.check({name: value}, Kinds)
-    with pytest.raises(ValueError, match="no option 'size', only whole, share,"):
+    with pytest.raises(ValueError, match="no option 'size', only .*whole"):
         crane_env.check({"size": 3}, Kinds)
 
 
@@ -261,7 +261,7 @@ def test_no_code_of_a_checkpoint_runs(tmp_path, run_here, algorithm):
     saved |= {"weights": Harmful(), "optimizer": {}, "iteration": 1, "difficulty": 1.0}
     torch.save(saved, tmp_path / "checkpoint.pt")
     torch.save(saved, tmp_path / "policy.pt")
-    with pytest.raises(SystemExit, match="checkpoint.pt is damaged or does not fit"):
+    with pytest.raises(SystemExit, match="checkpoint.pt is damaged or not of this script"):
         run_here(algorithm, "--resume", ".")
     with pytest.raises(SystemExit, match="is no policy.pt"):
         eval_crane.load_policy(tmp_path / "policy.pt")
@@ -315,7 +315,7 @@ def test_resume_of_a_finished_run_changes_nothing(finished, run_here, capsys):
     assert len(values["final/episodic_return"]) == 1 and values["charts/updates"] == [1, 2]
     assert (run_dir / "checkpoint.pt").read_bytes() == before
     again = capsys.readouterr().out
-    assert "all updates are done; a larger --total-timesteps extends the run" in again
+    assert "all 2 updates are done; more --total-timesteps extend the run" in again
     assert f"final/episodic_return: {values['final/episodic_return'][0]:.3f}" in again
 
 

@@ -37,6 +37,8 @@ options = st.fixed_dictionaries(
 
 def run(cranes, decisions, seed, chosen):
     """Bang-bang and uniform actions by turns, each held for a while, beyond the box at times."""
+    if chosen.get("curriculum"):
+        chosen = chosen | {"difficulty": 1.0}  # it sets the difficulty itself
     envs, rng = CraneVectorEnv(cranes, env_threads=2, **chosen), np.random.default_rng(seed)
     obs, _ = envs.reset(seed=seed)
     actions, ends = np.zeros((cranes, 6)), 0

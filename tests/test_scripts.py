@@ -549,16 +549,14 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         (tmp_path / name).mkdir()
     (tmp_path / "text" / "checkpoint.pt").write_text("no checkpoint")
     for name, reason in [
-        ("other", f"it is of other, task revision {crane_env.REVISION}"),
-        ("task", f"it is of {algorithm}, task revision {crane_env.REVISION - 1}"),
-        ("more", "unexpected keyword argument 'warp'"),
-        ("policy", "it lacks what a checkpoint has, as a policy.pt does"),
-        ("old", ""),
-        ("text", ""),
+        ("other", f"is of other, task revision {crane_env.REVISION}"),
+        ("task", f"is of {algorithm}, task revision {crane_env.REVISION - 1}"),
+        ("more", "is damaged or not of this script"),
+        ("policy", "lacks what a checkpoint has, as a policy.pt does"),
+        ("old", "is damaged or not of this script"),
+        ("text", "is damaged or not of this script"),
     ]:
-        error = error_of("--resume", name)
-        assert error.startswith(f"--resume: {name}/checkpoint.pt is damaged or does not fit: ")
-        assert reason in error and "\n" not in error
+        assert error_of("--resume", name) == f"--resume: {name}/checkpoint.pt {reason}"
     for name in ("empty", "nowhere", "text/checkpoint.pt"):
         assert error_of("--resume", name) == f"--resume: there is no {name}/checkpoint.pt"
     batches = "num_minibatches" if algorithm == "recurrent_ppo" else "minibatch_size"
@@ -574,7 +572,10 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         ("--num-steps 1000000000", "num_steps must be a whole number in [1, 16,384], got 1000000"),
         ("--num-envs 16384 --num-steps 65", "--num-envs times --num-steps must be at most 1,048,"),
         (f"--{batches} 0", f"{batches} must be a whole number in ["),
-        ("--hidden-sizes 64 0", "hidden_sizes must be a whole number in [1, 16,384], got (64, 0)"),
+        (
+            "--hidden-sizes 64 0",
+            "each of hidden_sizes must be a whole number in [1, 4,096], got (64, 0)",
+        ),
         ("--eval-trials 0", "eval_trials must be a whole number in [1, 1,000], got 0"),
         ("--seed -1", "seed must be a whole number in [0, 4,294,967,295], got -1"),
         ("--gamma 1.01", "gamma must be a number in [0, 1], got 1.01"),
