@@ -877,8 +877,9 @@ def one_line_errors(hint: str = "") -> None:
     sys.excepthook, threading.excepthook = report, report_of_thread
 
 
-def say(line: str, stream: TextIO = sys.stdout) -> None:
+def say(line: str, stream: TextIO | None = None) -> None:
     """Print a line, unless the terminal or the pipe is closed. Then nothing more goes there."""
+    stream = stream or sys.stdout
     try:
         print(line, file=stream, flush=True)
     except OSError:
