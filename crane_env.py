@@ -7,10 +7,11 @@
 The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
 stages), and its grapple hangs from two passive joints q5, q6 below a rotator q7 and two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
-Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there.
+Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there,
+`ForestryCraneHydraulic-v0` the same crane with the drives that were measured on the machine.
 Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
 
-Observation, float32, `Box` of shape (18,):
+Observation, float32, `Box` of shape (18,), with rates (26,):
 
 | index | meaning                                          | unit  | low     | high   |
 |-------|--------------------------------------------------|-------|---------|--------|
@@ -32,8 +33,17 @@ Observation, float32, `Box` of shape (18,):
 | 15    | Delta_p,y                                        | m     | -20     | 20     |
 | 16    | Delta_p,z, see offset                            | m     | -20     | 20     |
 | 17    | signed angle to the log, 0 aligned, see below    | rad   | -4.7124 | 4.7124 |
+| 18    | last command of q1, fraction of its limit        | 1     | -1      | 1      |
+| 19    | last command of q2                               | 1     | -1      | 1      |
+| 20    | last command of q3                               | 1     | -1      | 1      |
+| 21    | last command of q4                               | 1     | -1      | 1      |
+| 22    | last command of q7                               | 1     | -1      | 1      |
+| 23    | last command of q8                               | 1     | -1      | 1      |
+| 24    | q5 velocity                                      | rad/s | -10     | 10     |
+| 25    | q6 velocity                                      | rad/s | -10     | 10     |
 
-With signed_yaw=False index 17 is the paper's Delta_psi, without unit.
+Indices 18 to 25 exist with rates=True only, as in `ForestryCraneHydraulic-v0`. With
+signed_yaw=False index 17 is the paper's Delta_psi, without unit.
 
 Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
 direction. 0 stops the joint; values outside the box are clipped.
@@ -128,11 +138,29 @@ SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telesco
     ),
     "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
 }
+# The machine's drives: q1, q2, q3, each telescope stage, q7, q8 (assets/README.md). Oil drives a
+# joint like a spring whose rest position moves at the commanded speed.
+STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 5.0e4])  # N m/rad, N/m
+DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 1300.0])  # N m s/rad, N s/m
+MAX_FORCE = np.array([3.181e4, 2e5, 1e5, 5e4, 2.2e3, 1.2e4])  # N m, N
+LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.06])  # s, of the valve, first order
+DEAD_TIME = np.array([0.117, 0.081, 0.044, 0.060, 0.058, 0.060])  # s
+BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
+MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
+VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
+PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
+# Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
+# The telescope extends with the oil of its rod side; q8 moves its cylinder 0.292 m in 3 rad.
+OIL = np.array(
+    [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
+     [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
+)  # fmt: skip
 # The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
 SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
 ACTUATED = [0, 1, 2, 3, 6, 7]  # of our q1 ... q8
+PASSIVE = [4, 5]  # of our q1 ... q8
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 
 TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance"]
@@ -206,6 +234,8 @@ class Options(TypedDict, total=False):
     """
 
     frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (20)
+    actuators: Literal["ideal", "hydraulic"]  # servos, or the machine's own drives (ideal)
+    rates: bool  # also observe the last command and the rates of q5 and q6 (False)
     contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
     reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
     speed: Literal["real", "mjcf"]  # joint speed limits (real)
@@ -221,14 +251,16 @@ class Options(TypedDict, total=False):
 
 
 DEFAULTS = Options(
-    frame_skip=20, contact="primitive", reward="staged", speed="real", offset="plus",
-    signed_yaw=True, axes="crane", pose_noise="none", difficulty=1.0, curriculum=False, retry=0.0,
-    integrator="implicitfast", solver="Newton",
+    frame_skip=20, actuators="ideal", rates=False, contact="primitive", reward="staged",
+    speed="real", offset="plus", signed_yaw=True, axes="crane", pose_noise="none",
+    difficulty=1.0, curriculum=False, retry=0.0, integrator="implicitfast",
+    solver="Newton",
 )  # fmt: skip
 PAPER = Options(  # ForestryCranePaper-v0
     frame_skip=1, contact="sdf", reward="paper", offset="minus", signed_yaw=False, axes="world",
     integrator="implicit", solver="CG",
 )  # fmt: skip
+HYDRAULIC = Options(actuators="hydraulic", rates=True)  # ForestryCraneHydraulic-v0
 
 
 def complete(options: Options) -> Options:
@@ -244,10 +276,12 @@ def load_model(
     contact: str = "primitive",
     integrator: str = "implicitfast",
     solver: str = "Newton",
+    actuators: str = "ideal",
     visual: bool = True,
 ) -> mujoco.MjModel:
     """Compile assets/crane.xml.
 
+    actuators "ideal": PI velocity servos. "hydraulic": the drives identified on the machine.
     contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
     jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B).
     visual False leaves out what is only drawn: the same motion, sooner.
@@ -265,8 +299,45 @@ def load_model(
                 geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_SDF, 4
             elif geom.classname.name == "jaw_collision":
                 geom.conaffinity &= ~4
+    if actuators == "hydraulic":
+        for servo, command in zip(SERVOS, COMMAND_OF_SERVO):
+            joint = spec.joints[servo]
+            joint.damping[0] = DAMPING[command]
+            joint.actfrcrange = [-MAX_FORCE[command], MAX_FORCE[command]]
+            spec.actuator(joint.name).gainprm[0] = spec.actuator(joint.name).biasprm[2] = 0
+            drive = spec.actuator(f"{joint.name}_integral")
+            drive.gainprm[0], drive.biasprm[1] = STIFFNESS[command], -STIFFNESS[command]
+            drive.delay, drive.nsample = DEAD_TIME[command], MAX_DELAY
+        for name, damping, friction in (("q5", 15.0, 10.0), ("q6", 20.0, 5.0)):
+            spec.joint(name).damping[0], spec.joint(name).frictionloss = damping, friction
     spec.compiler.discardvisual = not visual
     return spec.compile()
+
+
+def cylinder_levers(q2: Array, q3: Array) -> Array:
+    """Metres that boom and arm cylinder lengthen per radian of q2 and q3, (2, N).
+
+    The arm's cylinder pushes the arm itself. The boom's pushes the joint of two bars, 0.57 m to
+    the column and 0.124 m to the boom.
+    """
+
+    def boom(q: Array) -> Array:
+        x, y = 0.4539 * np.cos(q) + 0.036 * np.sin(q) + 0.12, 0.4539 * np.sin(q) - 0.036 * np.cos(q)
+        y = y + 0.07  # from the bars' pivot on the column to that on the boom
+        apart = np.hypot(x, y)
+        along = (0.57**2 - 0.124**2 + apart**2) / (2 * apart)
+        across = np.sqrt(np.maximum(0.57**2 - along**2, 0))
+        foot_x, foot_y = 0.553, -1.6982  # of the cylinder, from the same pivot
+        knee_x, knee_y = (along * x + across * y) / apart, (along * y - across * x) / apart
+        return np.hypot(knee_x - foot_x, knee_y - foot_y)
+
+    def arm(q: Array) -> Array:
+        x, y = -0.118 * np.cos(q) + 0.468 * np.sin(q), -0.118 * np.sin(q) - 0.468 * np.cos(q)
+        return np.hypot(x + 1.6802, y + 0.0485)
+
+    step = 1e-4
+    levers = [(f(q + step) - f(q - step)) / (2 * step) for f, q in ((boom, q2), (arm, q3))]
+    return np.array(levers)
 
 
 def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
@@ -495,8 +566,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
         self.metadata["autoreset_mode"] = self.autoreset_mode
 
-        engine = options["contact"], options["integrator"], options["solver"]
+        engine = (options[name] for name in ("contact", "integrator", "solver", "actuators"))
         self.model = load_model(*engine, visual=render_mode is not None)
+        self.hydraulic = options["actuators"] == "hydraulic"
         self.batch = batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
         ALIVE.add(self)
         for field in ("geom_size", "body_mass", "body_inertia"):
@@ -510,6 +582,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.servo_kp = integrators[:, 0]
         self.max_lead = self.model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp
 
+        self.command = np.zeros((self.num_envs, 6))  # rad/s, m/s, of the last decision
+        self.opening = np.zeros((self.num_envs, 6))  # rad/s, m/s, what the valves let through
+        self.telescope_wait = np.zeros(self.num_envs)  # s since a resting telescope was commanded
         self.decisions = np.zeros(self.num_envs, int)  # since the start of each episode
         self.reach_time = np.full(self.num_envs, np.inf)  # s
         self.streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
@@ -522,6 +597,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
         bound = np.repeat([10.0, 20.0, 1.5 * np.pi], [6, 3, 1])  # dq, Delta_p, its angle
+        if options["rates"]:
+            bound = np.append(bound, np.repeat([1.0, 10.0], [6, 2]))  # command, dq5 and dq6
         bounds = np.float32([[*low, *-bound], [*high, *bound]])
         self.single_observation_space = gymnasium.spaces.Box(*bounds)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
@@ -586,7 +663,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("actions must be finite, got NaN or infinity")
         actions = np.clip(actions, -1, 1)
         command = np.where(actions < 0, -actions * self.speed[0], actions * self.speed[1])
-        diverged = self.simulate(command[:, COMMAND_OF_SERVO])
+        self.command = command
+        diverged = self.simulate(command)
         self.decisions += 1
 
         state, time = self.state(), self.decisions * self.dt
@@ -625,19 +703,26 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.recent_success.clear()
 
     def simulate(self, command: Array) -> Array:
-        """frame_skip physics steps under servo commands (N, 8); which cranes diverged, (N,)."""
+        """frame_skip physics steps under a command (N, 6), rad/s and m/s; which diverged, (N,)."""
         self.stay_in_process()
-        self.ctrl[:] = np.tile(command, 2)  # of the velocity servos and of their integrators
+        if not self.hydraulic:
+            self.ctrl[:] = np.tile(command[:, COMMAND_OF_SERVO], 2)  # servos and their integrators
         failed = np.zeros(self.num_envs, bool)
         # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
         # lead keeps squeezing the log at zero command, as a check valve does. If a decision is
-        # shorter than ANTI_WINDUP, only every k-th decision of an episode clamps the integrators.
-        due = self.decisions % max(1, ANTI_WINDUP // self.frame_skip) == 0
-        for start in range(0, self.frame_skip, ANTI_WINDUP):
+        # shorter than a piece, only every k-th decision of an episode clamps the integrators.
+        piece = VALVE_STEPS if self.hydraulic else ANTI_WINDUP
+        every = max(1, piece // self.frame_skip)
+        due = self.decisions % every == 0
+        for start in range(0, self.frame_skip, piece):
             position = self.qpos[:, SERVOS]
             low, high = position - self.max_lead, position + self.max_lead
             np.clip(self.act, low, high, out=self.act, where=due[:, None])
-            nstep = min(ANTI_WINDUP, self.frame_skip - start)
+            nstep = min(piece, self.frame_skip - start)
+            if self.hydraulic:
+                ids = np.flatnonzero(due)
+                flow = self.valves(ids, command[ids], nstep * every * TIMESTEP)
+                self.ctrl[ids, 8:] = flow[:, COMMAND_OF_SERVO]
             # sensors are needed after the last physics step only
             last = start + nstep == self.frame_skip
             stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
@@ -647,6 +732,26 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 failed[error.ids] = True
         finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
         return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
+
+    def valves(self, ids: Array, command: Array, seconds: float) -> Array:
+        """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
+
+        A valve follows its command as a first-order lag. A resting telescope's load-holding valve
+        opens late. If all joints ask for more oil than the pump gives, all get the same share.
+        """
+        opening, telescope = self.opening[ids], command[:, 3]
+        resting = (np.abs(opening[:, 3]) < 1e-3) & (telescope != 0)
+        self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
+        closed = resting & (self.telescope_wait[ids] <= BREAKAWAY)
+        target = command.copy()
+        target[closed, 3] = 0.0
+        decay = np.exp(-seconds / LAG)
+        mean = target + (opening - target) * LAG / seconds * (1 - decay)
+        self.opening[ids] = target + (opening - target) * decay
+        oil = np.where(mean < 0, OIL[0], OIL[1])
+        oil[:, 1:3] *= cylinder_levers(self.qpos[ids, 1], self.qpos[ids, 2]).T
+        demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
+        return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
 
     def start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
         """New episodes in cranes `ids`; observations and info of all cranes."""
@@ -690,6 +795,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
         self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp
+        self.command[ids] = self.opening[ids] = self.telescope_wait[ids] = 0
         self.decisions[ids] = 0
         self.reach_time[ids] = np.inf
         self.streaks[:, ids] = 0
@@ -701,7 +807,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0])
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
-        """Observations (N, 18), float32, inside the observation space; what `info` says of them."""
+        """Observations (N, 18 or 26), float32, inside their space; what `info` says of them."""
         delta_p, delta_psi, signed_angle = relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
         clearance, miss = log_clearance(state), centre_miss(state)
@@ -716,7 +822,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if self.options["axes"] == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
-        obs = np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
+        parts = [state.q, state.dq, delta_p, angle[:, None]]
+        if self.options["rates"]:
+            limit = np.where(command < 0, -self.speed[0], self.speed[1])
+            parts += [command / limit, self.qvel[:, JOINTS][:, PASSIVE]]
+        obs = np.concatenate(parts, axis=-1)
         obs[np.isnan(obs)] = 0  # of a crane that diverged
         space = self.single_observation_space
         return np.clip(obs, space.low, space.high).astype(np.float32, order="C"), info
@@ -848,6 +958,7 @@ class CraneEnv(gymnasium.Env):
 CLASSES = {"entry_point": "crane_env:CraneEnv", "vector_entry_point": "crane_env:CraneVectorEnv"}
 gymnasium.register("ForestryCrane-v0", **CLASSES)
 gymnasium.register("ForestryCranePaper-v0", kwargs=PAPER, **CLASSES)
+gymnasium.register("ForestryCraneHydraulic-v0", kwargs=HYDRAULIC, **CLASSES)
 
 
 # ---- training and judging

@@ -118,11 +118,13 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
     if "frame_skip" not in task:
         raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
+    task = crane_env.DEFAULTS | task  # older files do not know all options
     if task["revision"] != crane_env.REVISION:
         print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
     script = ALGORITHMS[algorithm]
     try:
-        agent = script.Agent(18, np.full(6, -1.0), np.full(6, 1.0), script.Args(**args))
+        obs_dim, bound = len(weights["obs_mean"]), np.ones(6)
+        agent = script.Agent(obs_dim, -bound, bound, script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
     except Exception as error:
@@ -152,6 +154,8 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
         raise SystemExit(f"--env-id {env_id} is not the crane")
     names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "curriculum", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
+    if args.policy == "file":
+        options["rates"] = trained_on["rates"]  # what its networks read
     options |= {"contact": args.contact} if args.contact else {}
     if args.policy == "scripted":
         options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}

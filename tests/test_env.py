@@ -53,6 +53,8 @@ def test_the_papers_task_is_as_printed():
     env = gymnasium.make("ForestryCranePaper-v0").unwrapped
     assert env.envs.options == {
         "frame_skip": 1,
+        "actuators": "ideal",
+        "rates": False,
         "contact": "sdf",
         "reward": "paper",
         "speed": "real",
@@ -120,13 +122,18 @@ def docstring_table(first_column_values):
 
 
 def test_observation_table_matches_the_space():
-    table = docstring_table(18)
-    space = CraneVectorEnv(1).single_observation_space
+    table = docstring_table(26)
+    space = CraneVectorEnv(1, rates=True).single_observation_space
     np.testing.assert_allclose([float(r[2]) for r in table], space.low, atol=1e-4)
     np.testing.assert_allclose([float(r[3]) for r in table], space.high, atol=1e-4)
-    assert space.shape == (18,) and space.dtype == np.float32
+    assert space.shape == (26,) and space.dtype == np.float32
+    short = CraneVectorEnv(1).single_observation_space
+    assert short == gymnasium.spaces.Box(space.low[:18], space.high[:18])
     assert [r[0].split()[0] for r in table[:8]] == NAMES
     assert [r[0].split()[0] for r in table[8:14]] == [NAMES[i] for i in crane_env.ACTUATED]
+    commands = [r[0].split(",")[0] for r in table[18:24]]
+    assert commands == [f"last command of {NAMES[i]}" for i in crane_env.ACTUATED]
+    assert [r[0] for r in table[24:]] == ["q5 velocity", "q6 velocity"]
 
 
 def test_action_table_matches_the_space_and_speeds():

@@ -166,7 +166,7 @@ def test_task_to_judge_on(capsys):
     assert options_of(trained_on=trained_on, contact="sdf") == changed
     assert capsys.readouterr().err == ""
     # another task is taken as it is registered, and what the policy does not know is said
-    assert options_of(trained_on=trained_on, env_id=CRANE) == (CRANE, {})
+    assert options_of(trained_on=trained_on, env_id=CRANE) == (CRANE, {"rates": False})
     said = capsys.readouterr().err.splitlines()
     assert sorted(line.split("=")[0] for line in said) == [
         f"the policy knows {name}" for name in ("axes", "frame_skip", "offset", "signed_yaw")

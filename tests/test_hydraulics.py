@@ -1,0 +1,220 @@
+"""The machine's drives: its measured step responses, valves, pump, what the policy sees of them."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import crane_env
+from crane_env import ACTUATED, JOINTS, CraneVectorEnv
+
+# Geryyy/crane_model, test/step_response_fixture.json: (speed - before) / (settled - before) after
+# a step of the velocity command at 0, mean over the edges of a recording
+TIMES = np.array([0.06, 0.10, 0.15, 0.20, 0.30, 0.45, 0.60, 0.90, 1.20])  # s
+MEASURED = {
+    "slew": [0.01, 0.02, 0.13, 0.33, 0.87, 1.42, 1.33, 0.75, 1.04],
+    "boom": [0.05, 0.01, 0.35, 0.70, 1.19, 0.90, 0.93],
+    "arm": [0.03, 0.08, 0.70, 1.04, 0.87, 0.88, 0.89],
+    "telescope": [0.01, 0.01, -0.01, 0.08, 0.84, 1.22, 1.05],
+    "rotator": [0.02, 0.02, 0.12, 0.33, 0.76, 0.95, 0.98],
+}
+INERTIA = {"slew": 4251, "boom": 4855, "arm": 5923, "telescope": 1690, "rotator": 49.6}
+LABS_FIT = {"slew": 0.23, "boom": 0.23, "arm": 0.40, "telescope": 0.79, "rotator": 0.09}
+AXES = list(MEASURED)
+POSES = {  # q2, q3, q4, q8, with the grapple off the ground and clear of the truck
+    "slew": (1.2, -0.5, 0.0, 0.3),
+    "boom": (0.38, 0.5, 0.0, 0.3),
+    "arm": (0.51, 0.03, 0.0, 0.3),
+    "telescope": (0.51, 1.0, 1.16, 0.3),
+    "rotator": (0.52, 1.04, 0.09, 1.35),
+}
+FAR_LOG = np.array([[-20.0, 0.0, 0.0]])
+
+
+def hydraulic(n=1, **options):
+    envs = CraneVectorEnv(n, env_threads=1, **{"actuators": "hydraulic", "rates": True, **options})
+    envs.reset(seed=0)
+    return envs
+
+
+def speeds(envs):
+    return envs.qvel[:, JOINTS][:, ACTUATED]
+
+
+def settled(axis):
+    """One crane, a decision every 5 ms, at rest in the pose of an axis, with its inertia."""
+    envs = hydraulic(frame_skip=1)
+    q2, q3, q4, q8 = POSES[axis]
+    q = np.array([[-1.2, q2, q3, q4, np.pi / 2 - q2 - q3, np.pi / 2, 0, q8]])
+    here = (np.zeros(1, int), q, FAR_LOG, np.array([0.3]))
+    envs.place(*here)
+    model, data = envs.batch.get_model(0), envs.batch.get_data(0)
+    mujoco.mj_forward(model, data)
+    moving, momentum = np.zeros(model.nv), np.zeros(model.nv)
+    moving[{"telescope": [3, 4], "rotator": [7]}.get(axis, [AXES.index(axis)])] = 1
+    mujoco.mj_mulM(model, data, momentum, moving)
+    scale = INERTIA[axis] / (moving @ momentum)  # of all masses: equal inertia about this axis
+    for body in range(1, model.nbody - 1):
+        view = envs.batch.body(model.body(body).name)
+        view.mass[:] *= scale
+        view.inertia[:] *= scale
+    envs.place(*here)
+    for _ in range(40):
+        envs.advance(np.zeros((1, 6)))
+    return envs
+
+
+def response(axis, action):
+    """Speed over commanded speed after each of 250 physics steps."""
+    envs, i = settled(axis), AXES.index(axis)
+    before, actions = speeds(envs)[0, i], np.zeros((1, 6))
+    actions[0, i] = action
+    low, high = envs.speed[:, i]
+    target = action * (high if action > 0 else -low)
+    curve = []
+    for _ in range(250 if axis == "slew" else 125):
+        envs.advance(actions)
+        curve.append((speeds(envs)[0, i] - before) / target)
+    return np.array(curve)
+
+
+@pytest.mark.parametrize("action", [0.4, -0.4])
+@pytest.mark.parametrize("axis", AXES)
+def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis, action):
+    """Closer at every listed instant than the identified model of the lab that measured it."""
+    measured = np.array(MEASURED[axis])
+    steps = np.round(TIMES[: len(measured)] / crane_env.TIMESTEP).astype(int) - 1
+    worst = np.abs(response(axis, action)[steps] - measured).max()
+    assert worst < LABS_FIT[axis]
+
+
+def test_drives_lie_within_the_identified_bands():
+    """Stiffness and damping relative to the lab's own numbers; per stage of the telescope half."""
+    stiffness = np.array([3.191e5, 1.834e6, 5.78e5, 3.5e6 / 2, 7296])
+    damping = np.array([7520, 1.656e5, 4.70e4, 1.339e5 / 2, 483.7])
+    bands = [(0.63, 1.25), (0.70, 1.50), (0.5, 3), (0.06, 1.5), (0.35, 1.7)]
+    for ratio, (low, high) in zip(crane_env.STIFFNESS[:5] / stiffness, bands):
+        assert low <= ratio <= high
+    bands = [(0.84, 2.2), (0.4, 2.3), (0.7, 1.5), (0.12, 2.4), (0.13, 3.3)]
+    for ratio, (low, high) in zip(crane_env.DAMPING[:5] / damping, bands):
+        assert low <= ratio <= high
+    assert (crane_env.DEAD_TIME >= 0.04).all() and (crane_env.DEAD_TIME <= 0.15).all()
+
+
+def test_the_same_motion_at_any_frame_skip():
+    """One command every 0.1 s, held for 1, 5 and 20 decisions of 20, 4 and 1 physics steps."""
+    rng, ends = np.random.default_rng(0), {}
+    actions = rng.uniform(-1, 1, (25, 6, 6))
+    for frame_skip in (20, 4, 1):
+        envs = hydraulic(6, frame_skip=frame_skip)
+        for action in actions:
+            for _ in range(20 // frame_skip):
+                envs.advance(action)
+        ends[frame_skip] = envs.qpos.copy()
+    np.testing.assert_array_equal(ends[20], ends[4])
+    np.testing.assert_array_equal(ends[20], ends[1])
+    assert np.abs(envs.qvel).max() > 0.1
+
+
+def test_nothing_moves_within_the_dead_time():
+    envs = hydraulic(frame_skip=1)
+    before = envs.act[0].copy()
+    moved = np.zeros(6)
+    for k in range(1, 40):
+        envs.advance(np.full((1, 6), 0.5))
+        servos = np.abs(envs.act[0] - before)[[0, 1, 2, 3, 5, 6]] > 1e-9
+        moved = np.where((moved == 0) & servos, k * crane_env.TIMESTEP, moved)
+    late = np.array(crane_env.DEAD_TIME)
+    late[3] += crane_env.BREAKAWAY
+    assert (moved > late).all() and (moved <= late + 0.03).all()
+
+
+def test_a_moving_telescope_needs_no_breakaway():
+    """Its valve opens late from rest only, and closes again at rest."""
+    envs = hydraulic()
+    action = np.array([[0, 0, 0, 0.5, 0, 0]])
+    first = [envs.valves(np.array([0]), action, 0.02)[0, 3] for _ in range(8)]
+    assert first[:5] == [0] * 5 and first[5] > 0 and first[7] == pytest.approx(0.5, rel=0.01)
+    assert envs.valves(np.array([0]), -action, 0.02)[0, 3] < 0  # straight through zero
+    for _ in range(10):
+        envs.valves(np.array([0]), 0 * action, 0.02)
+    assert envs.valves(np.array([0]), action, 0.02)[0, 3] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_lag_of_a_valve_is_exact_over_any_step():
+    """Ten steps of 2 ms let through what one of 20 ms does."""
+    command = np.array([[0.1, -0.05, 0.08, 0.0, 0.3, -0.2]])
+    once, often = hydraulic(), hydraulic()
+    mean = once.valves(np.array([0]), command, 0.02)
+    each = [often.valves(np.array([0]), command, 0.002) for _ in range(10)]
+    np.testing.assert_allclose(np.mean(each, axis=0), mean, atol=1e-12)
+    np.testing.assert_allclose(often.opening, once.opening, atol=1e-12)
+
+
+def test_all_joints_share_the_pump():
+    """Full speed everywhere asks for several times its flow; little asks get all they want."""
+    envs = hydraulic()
+    ids, low, high = np.array([0]), *envs.speed
+    for _ in range(100):
+        full, fast = envs.valves(ids, high[None], 0.02), envs.opening.copy()
+    np.testing.assert_allclose(full / fast, (full / fast)[0, 0])  # one share for all
+    q2, q3 = envs.qpos[0, 1:3]
+    lever = np.ones(6)
+    lever[1:3] = crane_env.cylinder_levers(np.array([q2]), np.array([q3]))[:, 0]
+    flow = np.sum(crane_env.OIL[1] * lever * full[0])
+    assert flow == pytest.approx(0.95 * 1.4e-3) and full[0, 0] < 0.5 * high[0]
+    for _ in range(100):
+        little = envs.valves(ids, 0.1 * low[None], 0.02)
+    np.testing.assert_allclose(little, 0.1 * low[None], rtol=1e-5)
+
+
+def test_levers_of_the_cylinders():
+    """Against their lengths, and never zero, so that oil always moves the joint."""
+    q2, q3 = np.linspace(-1.1, 1.563, 40), np.linspace(-0.91, 1.5, 40)
+    boom, arm = crane_env.cylinder_levers(q2, q3)
+    assert (0.05 < boom).all() and (boom < 0.5).all()
+    assert (0.1 < arm).all() and (arm < 0.5).all() and 0.3 < arm.mean() < 0.4
+    # the arm's cylinder at q3 = 0, by hand: from (-1.6802, -0.0485) to (-0.118, -0.468)
+    x, y = -0.118 + 1.6802, -0.468 + 0.0485
+    expected = abs(-0.118 * y - -0.468 * x) / np.hypot(x, y)
+    _, (lever,) = crane_env.cylinder_levers(np.zeros(1), np.zeros(1))
+    assert lever == pytest.approx(expected, abs=1e-4)
+
+
+def test_passive_joints_and_force_limits_are_the_machines():
+    model = hydraulic().model
+    for name, damping, friction in (("q5", 15, 10), ("q6", 20, 5)):
+        dof = model.joint(name).dofadr[0]
+        assert model.dof_damping[dof] == damping and model.dof_frictionloss[dof] == friction
+    limits = [3.181e4, 2e5, 1e5, 5e4, 5e4, 2.2e3, 1.2e4, 1.2e4]
+    np.testing.assert_allclose(model.jnt_actfrcrange[crane_env.SERVOS, 1], limits)
+    assert (model.actuator_gainprm[:8, 0] == 0).all()  # no velocity servo is left
+
+
+def test_the_policy_sees_its_last_command_and_the_swing():
+    envs = hydraulic(4)
+    rng = np.random.default_rng(0)
+    obs, _ = envs.reset(seed=0)
+    assert obs.shape == (4, 26) and not obs[:, 18:].any()
+    for _ in range(5):
+        actions = rng.uniform(-1.5, 1.5, (4, 6))
+        obs, *_ = envs.advance(actions)
+        np.testing.assert_allclose(obs[:, 18:24], np.clip(actions, -1, 1), atol=1e-6)
+        np.testing.assert_allclose(obs[:, 24:], envs.qvel[:, [5, 6]], atol=1e-5)
+    assert np.abs(obs[:, 24:]).max() > 0.01
+
+
+def test_an_idle_hydraulic_crane_stays():
+    """It neither sags nor drifts in ten seconds, at the starts of the task."""
+    envs = hydraulic(16)
+    before = envs.qpos[:, crane_env.SERVOS].copy()
+    for _ in range(100):
+        envs.advance(np.zeros((16, 6)))
+    assert np.abs(envs.qpos[:, crane_env.SERVOS] - before).max() < 0.02
+
+
+@pytest.mark.slow
+def test_fuzz_hydraulic():
+    from test_physics import fuzz
+
+    diverged, warnings, done = fuzz(hydraulic(32), 200_000, 5, True)
+    assert done > 180_000 and diverged == 0 and warnings == 0
