@@ -121,6 +121,8 @@ LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre
 LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.012 rad or 0.016 m
 HOLD_TIME = 0.5  # s at the end of an episode in which the log must be held
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
+GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.5 kN
+MAX_PRESSURE = 25e6  # Pa, of the pump
 MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
 
 OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
@@ -130,6 +132,7 @@ LIFT_WEIGHT = 2.0  # largest staged r_lift
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
 NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
+GROUND_WEIGHT = 3.0  # of r_ground at GENTLE_FORCE
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
@@ -155,6 +158,32 @@ OIL = np.array(
     [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
      [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
+# What randomize=1 draws uniformly at each start: what is nominal, lowest, highest. Per joint:
+# q1, q2, q3, each telescope stage, q7, q8. The bands are those of the identification.
+DRAWN = {
+    "stiffness": (
+        STIFFNESS,
+        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 2.5e4]),
+        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 7.5e4]),
+    ),
+    "damping": (
+        DAMPING,
+        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 650.0]),
+        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 2600.0]),
+    ),
+    "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
+    "gain": (  # factor on the speed, of movements down and up
+        np.ones((2, 6)),
+        np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
+        np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
+    ),
+    "density": (LOG_DENSITY, 450.0, 950.0),  # kg/m^3
+    "friction": (1.0, 0.5, 1.5),  # factor on that of all surfaces
+    "pose_error": (np.zeros(3), np.full(3, -0.057), np.full(3, 0.057)),  # m, 0.1 m at most
+    "yaw_error": (0.0, -0.1745, 0.1745),  # rad
+    "joint_error": (np.zeros(8), -0.0087 * (np.arange(8) != 3), 0.0087 * (np.arange(8) != 3)),
+    "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
+}
 # The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
 SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
@@ -163,10 +192,13 @@ ACTUATED = [0, 1, 2, 3, 6, 7]  # of our q1 ... q8
 PASSIVE = [4, 5]  # of our q1 ... q8
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 
-TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance"]
+TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]
 TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reached", "time_limit"]
 CONDITIONS = ["not_reached", "not_lifted", "not_held", "off_centre"]
-RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss", *CONDITIONS}
+COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
+CARE = ["gentle", *COSTS, "time_up", "log_speed"]
+RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
+RESULTS |= {*CONDITIONS, *CARE}
 Array = np.ndarray
 ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()
 LOCKS: list[FileLock] = []  # of the folders in which this process trains
@@ -235,6 +267,7 @@ class Options(TypedDict, total=False):
 
     frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (20)
     actuators: Literal["ideal", "hydraulic"]  # servos, or the machine's own drives (ideal)
+    randomize: Share  # width of the random errors of drives, log and sensors (0.0)
     rates: bool  # also observe the last command and the rates of q5 and q6 (False)
     contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
     reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
@@ -251,9 +284,9 @@ class Options(TypedDict, total=False):
 
 
 DEFAULTS = Options(
-    frame_skip=20, actuators="ideal", rates=False, contact="primitive", reward="staged",
-    speed="real", offset="plus", signed_yaw=True, axes="crane", pose_noise="none",
-    difficulty=1.0, curriculum=False, retry=0.0, integrator="implicitfast",
+    frame_skip=20, actuators="ideal", randomize=0.0, rates=False, contact="primitive",
+    reward="staged", speed="real", offset="plus", signed_yaw=True, axes="crane",
+    pose_noise="none", difficulty=1.0, curriculum=False, retry=0.0, integrator="implicitfast",
     solver="Newton",
 )  # fmt: skip
 PAPER = Options(  # ForestryCranePaper-v0
@@ -439,16 +472,20 @@ def reward_terms(
     clearance: Array,
     miss: Array,
     command: Array,
+    ground: Array | float = 0.0,
     kind: str = "staged",
 ) -> Array:
-    """The four terms r_distance, r_grapple, r_lift, r_balance, (4, N); the reward is their sum.
+    """The TERMS of the reward, which is their sum, (5, N).
 
     d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
-    `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s.
+    `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s,
+    ground (N,) the decision's largest force of crane on ground in N.
 
     kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
     the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
+    r_ground punishes hitting the ground, up to three times GENTLE_FORCE.
     """
+    r_ground = 0 * d_combine
     r_distance = np.exp(-OMEGA2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
     if kind == "paper":
@@ -465,7 +502,8 @@ def reward_terms(
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
         held = state.touching.all(axis=-1)
         r_lift, r_balance = LIFT_WEIGHT * lift, BALANCE_WEIGHT * calm * held * lift
-    return np.array([r_distance, r_grapple, r_lift, r_balance])
+        r_ground = -GROUND_WEIGHT * np.minimum(3, ground / GENTLE_FORCE) + r_ground
+    return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 
 def termination_rule(
@@ -511,6 +549,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     the same as `is_success` for Stable-Baselines3, and which of CONDITIONS failed it. The mask
     `_key` says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of
     an episode.
+
+    CARE says what the episode has cost so far: `ground_peak` (N), `ground_impulse` (N s) and
+    `ground_time` (s above GENTLE_FORCE) of the crane's force on the ground, `litres` of oil,
+    `energy` of the pump and `work` of the drives (J), `swing_peak` (rad) of the grapple, `time_up`
+    (s until the log is safely up, inf before), `log_speed` (m/s), and `gentle`: success without
+    more than GENTLE_FORCE on the ground. With randomize, `drawn_...` say what was drawn (DRAWN).
     """
 
     metadata = {
@@ -573,25 +617,40 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         ALIVE.add(self)
         for field in ("geom_size", "body_mass", "body_inertia"):
             batch.expand(field)  # each crane has a log of its own
+        if options["randomize"]:  # and a machine of its own
+            names = ("actuator_gainprm", "actuator_biasprm", "actuator_delay", "dof_damping")
+            self.engine = {name: batch.expand(name) for name in (*names, "geom_friction")}
         # live views of the engine's arrays, one row a crane
         self.qpos, self.qvel, self.act = batch.bind("qpos"), batch.bind("qvel"), batch.bind("act")
         self.ctrl, self.qfrc_bias = batch.bind("ctrl"), batch.bind("qfrc_bias")
         self.sensordata, self.log_size = batch.bind("sensordata"), batch.geom("log").size
+        self.log_velocity = batch.joint("log").qvel  # m/s and rad/s
+        self.drive_force = batch.bind("qfrc_actuator")
+        # the last sensor remembers its five last values, x, y, z each, after seven other numbers
+        begin = self.model.sensor_historyadr[-1] + 7
+        self.ground_force = batch.bind("history")[:, begin : begin + 15]
         self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
         _, integrators = np.split(self.model.actuator_gainprm, 2)  # after the velocity actuators
-        self.servo_kp = integrators[:, 0]
+        self.servo_kp = np.tile(integrators[:, 0], (self.num_envs, 1))
         self.max_lead = self.model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp
+        self.drawn = {
+            name: np.tile(nominal, (self.num_envs, *[1] * np.ndim(nominal)))
+            for name, (nominal, _, _) in DRAWN.items()
+        }
 
         self.command = np.zeros((self.num_envs, 6))  # rad/s, m/s, of the last decision
         self.opening = np.zeros((self.num_envs, 6))  # rad/s, m/s, what the valves let through
         self.telescope_wait = np.zeros(self.num_envs)  # s since a resting telescope was commanded
+        self.hit = np.zeros(self.num_envs)  # N, largest force on the ground in the last decision
+        self.costs = {name: np.zeros(self.num_envs) for name in COSTS}
+        self.time_up = np.full(self.num_envs, np.inf)  # s
         self.decisions = np.zeros(self.num_envs, int)  # since the start of each episode
         self.reach_time = np.full(self.num_envs, np.inf)  # s
         self.streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
         self.resting = np.zeros(self.num_envs, bool)  # NEXT_STEP: ended in the step before
         self.starts: list[tuple] = [()] * self.num_envs
         self.recent_success = deque(maxlen=200)  # of ended episodes
-        self.rngs: list[tuple[Generator, Generator]] | None = None
+        self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
         draws = self.max_decisions + 1 if options["pose_noise"] == "step" else 1
         self.noise = np.zeros((self.num_envs, draws, 2))  # epsilon_p, epsilon_o
 
@@ -616,8 +675,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
-            # starts and pose noise have streams of their own: noise leaves the starts as they are
-            self.rngs = [(default_rng(s), default_rng(s.generate_state(4))) for s in seeds]
+            # starts, pose noise and machines have streams of their own: one leaves the others alone
+            streams = [(s, s.generate_state(4), s.generate_state(8)[4:]) for s in seeds]
+            self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]
         self.resting[:] = False
         obs, info = self.start_episodes(np.arange(self.num_envs))
@@ -631,7 +691,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """
         obs, reward, terminated, truncated, info = self.advance(actions)
         done = terminated | truncated
-        of_ends = {"success", "is_success", *CONDITIONS}
+        of_ends = {"success", "is_success", "gentle", *CONDITIONS}
         everywhere = np.ones(self.num_envs, bool)
         info |= {f"_{key}": done if key in of_ends else everywhere for key in info}
         again = done
@@ -674,6 +734,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         reached = np.isfinite(self.reach_time)
         gripped = grip_conditions(info["clearance"], state.touching, info["centre_miss"])
         self.streaks = (self.streaks + 1) * gripped
+        safe = (self.streaks >= self.hold_decisions).all(axis=0)
+        self.time_up = np.where(safe, np.minimum(self.time_up, time), np.inf)
 
         ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
         ending[self.resting] = "none"
@@ -684,6 +746,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         failed = ~np.array([reached, *(self.streaks >= self.hold_decisions)])
         info |= dict(zip(CONDITIONS, failed)) | {"success": truncated & ~failed.any(axis=0)}
         info["is_success"] = info["success"]
+        info |= {name: cost.copy() for name, cost in self.costs.items()}
+        info["gentle"] = info["success"] & (info["ground_peak"] <= GENTLE_FORCE)
+        info["time_up"] = self.time_up.copy()
+        info["log_speed"] = np.linalg.norm(self.log_velocity[:, :3], axis=-1)
         info |= {"termination": ending, "time_to_reach": self.reach_time.copy()}
         reward = sum(info[term] for term in TERMS)
         for i in np.flatnonzero(ending != "none"):
@@ -708,6 +774,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if not self.hydraulic:
             self.ctrl[:] = np.tile(command[:, COMMAND_OF_SERVO], 2)  # servos and their integrators
         failed = np.zeros(self.num_envs, bool)
+        self.hit[:] = 0.0
         # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
         # lead keeps squeezing the log at zero command, as a check valve does. If a decision is
         # shorter than a piece, only every k-th decision of an episode clamps the integrators.
@@ -730,8 +797,33 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 self.batch.step(nstep=nstep, stage=stage)
             except SimulationError as error:
                 failed[error.ids] = True
+            self.count_costs(nstep * TIMESTEP)
         finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
         return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
+
+    def count_costs(self, seconds: float) -> None:
+        """Add to `costs` what the last piece of a decision took.
+
+        The ground's force is known at each physics step, all else at the last one. The pump gives
+        every joint its oil, at the pressure that the hardest of them needs.
+        """
+        ground = np.linalg.norm(self.ground_force.reshape(-1, 5, 3), axis=-1)
+        q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
+        force = self.drive_force[:, SERVOS] @ np.eye(6)[COMMAND_OF_SERVO]  # of both stages, jaws
+        oil = np.where(dq < 0, OIL[0], OIL[1])
+        oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+        flow = np.sum(oil * np.abs(dq), axis=-1)
+        pressure = np.clip(force * np.sign(dq) / oil, 0, MAX_PRESSURE).max(axis=-1)
+        swing = np.hypot(q[:, 4] - np.pi / 2 + q[:, 1] + q[:, 2], q[:, 5] - np.pi / 2)
+        costs = self.costs
+        self.hit = np.maximum(self.hit, ground.max(axis=-1))
+        costs["ground_peak"] = np.maximum(costs["ground_peak"], self.hit)
+        costs["ground_impulse"] += ground.mean(axis=-1) * seconds
+        costs["ground_time"] += (ground > GENTLE_FORCE).mean(axis=-1) * seconds
+        costs["litres"] += 1000 * flow * seconds
+        costs["energy"] += flow * pressure * seconds
+        costs["work"] += np.sum(np.abs(force * dq), axis=-1) * seconds
+        costs["swing_peak"] = np.maximum(costs["swing_peak"], swing)
 
     def valves(self, ids: Array, command: Array, seconds: float) -> Array:
         """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
@@ -739,6 +831,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         A valve follows its command as a first-order lag. A resting telescope's load-holding valve
         opens late. If all joints ask for more oil than the pump gives, all get the same share.
         """
+        gain = self.drawn["gain"][ids]
+        command = command * np.where(command < 0, gain[:, 0], gain[:, 1])
         opening, telescope = self.opening[ids], command[:, 3]
         resting = (np.abs(opening[:, 3]) < 1e-3) & (telescope != 0)
         self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
@@ -756,14 +850,19 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
         """New episodes in cranes `ids`; observations and info of all cranes."""
         for i in ids:
-            (start_rng, noise_rng), failures = self.rngs[i], self.failures[i]
+            (start_rng, noise_rng, machine_rng), failures = self.rngs[i], self.failures[i]
             retry = self.options["retry"]
             if retry and failures and start_rng.random() < retry:
                 self.starts[i] = failures[start_rng.integers(len(failures))]
             else:
                 self.starts[i] = sample_start(start_rng, self.difficulty)
             self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
+            if share := self.options["randomize"]:
+                for name, (nominal, low, high) in DRAWN.items():
+                    drawn = machine_rng.uniform(low, high)
+                    self.drawn[name][i] = nominal + share * (drawn - nominal)
         q, log_pose, diameter = (np.array(part) for part in zip(*[self.starts[i] for i in ids]))
+        q[:, 4:6] += self.drawn["swing"][ids]
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
@@ -782,28 +881,49 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.qpos[np.ix_(ids, JOINTS)] = q
         self.qpos[np.ix_(ids, SERVOS)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
 
-        mass = LOG_DENSITY * np.pi * radius**2 * LOG_LENGTH
+        mass = self.drawn["density"][ids] * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
         log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
         self.log_size[ids, 0] = capsule.size[ids, 0] = radius
         capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
         log.mass[ids, 0] = mass
         log.inertia[ids] = np.stack([across, across, along], axis=-1)
+        if self.options["randomize"]:
+            self.set_machine(ids)
         self.batch.set_const(ids)  # bounding volumes and inverse weights follow
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
-        self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp
+        self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp[ids]
         self.command[ids] = self.opening[ids] = self.telescope_wait[ids] = 0
         self.decisions[ids] = 0
-        self.reach_time[ids] = np.inf
+        self.reach_time[ids] = self.time_up[ids] = np.inf
+        for cost in (self.hit, *self.costs.values()):
+            cost[ids] = 0.0
         self.streaks[:, ids] = 0
+
+    def set_machine(self, ids: Array) -> None:
+        """Give the engine what was drawn for cranes `ids`. Ideal servos keep their gains."""
+        friction = self.model.geom_friction * self.drawn["friction"][ids, None, None]
+        self.engine["geom_friction"][ids] = friction
+        if not self.hydraulic:
+            return
+        stiffness = self.drawn["stiffness"][ids][:, COMMAND_OF_SERVO]
+        self.servo_kp[ids] = stiffness
+        self.max_lead[ids] = self.model.jnt_actfrcrange[SERVOS, 1] / stiffness
+        self.engine["actuator_gainprm"][ids, 8:, 0] = stiffness
+        self.engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
+        damping = self.drawn["damping"][ids][:, COMMAND_OF_SERVO]
+        self.engine["dof_damping"][np.ix_(ids, SERVOS)] = damping
+        late = self.drawn["late"][ids, None]
+        self.engine["actuator_delay"][ids, 8:] = self.model.actuator_delay[8:] + late
 
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
-        *poses, touch = np.split(self.sensordata.copy(), [3, 6, 9, 12], axis=1)  # as in crane.xml
+        # as in crane.xml; the force on the ground comes last
+        *poses, touch, _ = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14], axis=1)
         return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0])
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
@@ -813,16 +933,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         clearance, miss = log_clearance(state), centre_miss(state)
         kind = self.options["reward"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
-        terms = reward_terms(state, d_combine, clearance, miss, command, kind)
+        terms = reward_terms(state, d_combine, clearance, miss, command, self.hit, kind)
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
-        angle = signed_angle if self.options["signed_yaw"] else delta_psi
+        if self.options["randomize"]:
+            info |= {f"drawn_{name}": values.copy() for name, values in self.drawn.items()}
+        delta_p, q = delta_p + self.drawn["pose_error"], state.q + self.drawn["joint_error"]
+        angle = signed_angle + self.drawn["yaw_error"]
+        if not self.options["signed_yaw"]:
+            angle = delta_psi
         if self.options["pose_noise"] != "none":
             now = np.minimum(self.decisions, self.noise.shape[1] - 1)
             delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
         if self.options["axes"] == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
-        parts = [state.q, state.dq, delta_p, angle[:, None]]
+        parts = [q, state.dq, delta_p, angle[:, None]]
         if self.options["rates"]:
             limit = np.where(command < 0, -self.speed[0], self.speed[1])
             parts += [command / limit, self.qvel[:, JOINTS][:, PASSIVE]]

@@ -54,6 +54,7 @@ def test_the_papers_task_is_as_printed():
     assert env.envs.options == {
         "frame_skip": 1,
         "actuators": "ideal",
+        "randomize": 0.0,
         "rates": False,
         "contact": "sdf",
         "reward": "paper",
@@ -74,7 +75,7 @@ def test_the_papers_task_is_as_printed():
     np.testing.assert_allclose(obs[14:], [*delta_p[0], delta_psi[0]], rtol=1e-6)
     d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
     measured = crane_env.log_clearance(state), crane_env.centre_miss(state)
-    terms = crane_env.reward_terms(state, d_combine, *measured, command, "paper")
+    terms = crane_env.reward_terms(state, d_combine, *measured, command, kind="paper")
     np.testing.assert_allclose([info[term] for term in crane_env.TERMS], terms[:, 0])
     assert env.envs.dt == 0.005
     model = env.envs.batch.get_model(0)
@@ -648,7 +649,9 @@ def test_info_has_masks_and_what_sb3_reads(monkeypatch):
     _, info = env.reset(seed=0)
     assert set(info) == names
     info = env.step(np.zeros(6))[-1]
-    assert set(info) == names | of_ends | {"termination", "time_to_reach"}
+    of_ends |= {"gentle"}
+    costs = {*crane_env.CARE, "termination", "time_to_reach"}
+    assert set(info) == names | of_ends | costs
 
 
 def test_next_step_autoreset():

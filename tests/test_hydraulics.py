@@ -218,3 +218,97 @@ def test_fuzz_hydraulic():
 
     diverged, warnings, done = fuzz(hydraulic(32), 200_000, 5, True)
     assert done > 180_000 and diverged == 0 and warnings == 0
+
+
+# ---- randomize
+
+
+def test_randomize_draws_from_the_bands():
+    """Uniformly, anew at each start, scaled by the share; and says in info what it drew."""
+    for share in (1.0, 0.25):
+        envs = hydraulic(256, randomize=share)
+        _, info = envs.reset(seed=1)
+        for name, (nominal, low, high) in crane_env.DRAWN.items():
+            drawn = info[f"drawn_{name}"]
+            low, high = (nominal + share * (bound - nominal) for bound in (low, high))
+            assert (drawn >= low - 1e-9).all() and (drawn <= high + 1e-9).all(), name
+            wide = high > low
+            middle, width = (low + high) / 2, high - low
+            spread = np.abs(drawn.mean(axis=0) - middle) / np.where(wide, width, 1)
+            assert (spread[np.broadcast_to(wide, spread.shape)] < 0.09).all(), name  # 5 sigma
+            assert np.array_equal(drawn, envs.drawn[name])
+        again = envs.reset()[1]
+        assert np.abs(again["drawn_density"] - info["drawn_density"]).max() > 1
+        assert np.array_equal(
+            info["drawn_density"], hydraulic(256, randomize=share).reset(seed=1)[1]["drawn_density"]
+        )
+    assert not any(key.startswith("drawn") for key in hydraulic().reset(seed=0)[1])
+
+
+def test_what_is_drawn_reaches_the_engine():
+    envs = hydraulic(8, randomize=1.0)
+    _, info = envs.reset(seed=2)
+    servos = crane_env.COMMAND_OF_SERVO
+    for i in range(8):
+        model = envs.batch.get_model(i)
+        np.testing.assert_allclose(
+            model.actuator_gainprm[8:, 0], info["drawn_stiffness"][i, servos]
+        )
+        np.testing.assert_allclose(model.actuator_biasprm[8:, 1], -model.actuator_gainprm[8:, 0])
+        damping = model.dof_damping[crane_env.SERVOS]
+        np.testing.assert_allclose(damping, info["drawn_damping"][i, servos])
+        late = model.actuator_delay[8:] - crane_env.DEAD_TIME[servos]
+        np.testing.assert_allclose(late, info["drawn_late"][i], atol=1e-9)
+        assert (model.actuator_delay[8:] <= crane_env.MAX_DELAY * crane_env.TIMESTEP).all()
+        assert (model.actuator_delay[8:] >= crane_env.TIMESTEP).all()
+        radius = envs.state().diameter[i] / 2
+        density = model.body("log").mass[0] / (np.pi * radius**2 * crane_env.LOG_LENGTH)
+        assert density == pytest.approx(info["drawn_density"][i])
+        factor = model.geom_friction / envs.model.geom_friction
+        np.testing.assert_allclose(factor, info["drawn_friction"][i])
+        lead = envs.max_lead[i] * model.actuator_gainprm[8:, 0]
+        np.testing.assert_allclose(lead, model.jnt_actfrcrange[crane_env.SERVOS, 1])
+    assert np.abs(envs.qvel).max() == 0
+
+
+def test_what_is_drawn_reaches_the_observation_and_not_the_reward():
+    plain, random = hydraulic(8), hydraulic(8, randomize=1.0)
+    reference, before = plain.reset(seed=3)
+    obs, info = random.reset(seed=3)
+    swung = [4, 5]  # q5 and q6 start elsewhere, and with them the grapple
+    joints = [i for i in range(8) if i not in swung]
+    errors = info["drawn_joint_error"][:, joints]
+    np.testing.assert_allclose(obs[:, joints] - reference[:, joints], errors, atol=1e-5)
+    swing = random.state().q[:, swung] - plain.state().q[:, swung]
+    np.testing.assert_allclose(swing, info["drawn_swing"], atol=1e-6)
+    assert np.abs(errors).max() > 1e-3 and not info["drawn_joint_error"][:, 3].any()
+    delta_p, _, angle = crane_env.relative_pose(random.state())
+    cos, sin = np.cos(random.state().q[:, 0]), np.sin(random.state().q[:, 0])
+    x, y, z = (delta_p + info["drawn_pose_error"]).T
+    np.testing.assert_allclose(
+        obs[:, 14:17].T, [cos * x + sin * y, cos * y - sin * x, z], atol=1e-5
+    )
+    np.testing.assert_allclose(obs[:, 17], angle + info["drawn_yaw_error"], atol=1e-5)
+    true = np.linalg.norm(delta_p, axis=1) + crane_env.relative_pose(random.state())[1]
+    np.testing.assert_allclose(info["d_combine"], true)
+
+
+def test_the_speed_gain_is_that_of_the_direction():
+    envs = hydraulic(2, randomize=1.0)
+    envs.drawn["gain"][:] = np.array([np.full(6, 0.9), np.full(6, 1.2)])
+    command = 0.1 * envs.speed
+    for _ in range(100):
+        speed = envs.valves(np.arange(2), command, 0.02)
+    np.testing.assert_allclose(speed / command, [[0.9] * 6, [1.2] * 6], rtol=1e-4)
+
+
+def test_randomize_without_hydraulics():
+    """Log and sensors vary, the ideal servos do not."""
+    envs = CraneVectorEnv(4, randomize=1.0)
+    _, info = envs.reset(seed=0)
+    model = envs.batch.get_model(0)
+    np.testing.assert_array_equal(model.actuator_gainprm, envs.model.actuator_gainprm)
+    assert np.ptp(info["drawn_density"]) > 10
+    for _ in range(30):
+        obs, *_ = envs.step(np.ones((4, 6)))
+    assert obs in envs.observation_space

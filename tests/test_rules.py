@@ -103,7 +103,9 @@ COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaw
 def terms_of(crane, d_combine, *args, **kwargs):
     """The four terms of the reward of one crane."""
     measured = crane_env.log_clearance(crane), crane_env.centre_miss(crane)
-    return crane_env.reward_terms(crane, np.array([d_combine]), *measured, *args, **kwargs)[:, 0]
+    terms = crane_env.reward_terms(crane, np.array([d_combine]), *measured, *args, **kwargs)[:, 0]
+    assert terms[4] == 0 or "ground" in kwargs
+    return terms if "ground" in kwargs else terms[:4]
 
 
 def test_staged_reward():
@@ -134,8 +136,18 @@ def test_staged_reward():
     np.testing.assert_allclose(terms[1], 1.0)  # nearer than 0.35 m is no better for r_grapple
 
 
+def test_hitting_the_ground_costs():
+    """In proportion to the force, up to three times the gentle one; nothing in the paper's form."""
+    here = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1])
+    for force, expected in [(0.0, 0.0), (10e3, -1.5), (20e3, -3.0), (60e3, -9.0), (90e3, -9.0)]:
+        terms = terms_of(here, 0.4, COMMAND, ground=np.array([force]))
+        assert terms[4] == pytest.approx(expected)
+        np.testing.assert_array_equal(terms[:4], terms_of(here, 0.4, COMMAND))
+        assert terms_of(here, 0.4, COMMAND, ground=np.array([force]), kind="paper")[4] == 0
+
+
 def test_paper_reward():
-    terms = terms_of(state(log_centre=[4.0, 6.0, 0.7]), 0.25, COMMAND, "paper")
+    terms = terms_of(state(log_centre=[4.0, 6.0, 0.7]), 0.25, COMMAND, kind="paper")
     r = np.exp(-0.25)
     grapple = 0.5 * r + 0.5 * (1 - r)
     lift = (1 - np.tanh(0.3)) * (1 - grapple)
@@ -147,7 +159,7 @@ def test_printed_reward_pays_for_standing_still():
     """Why "staged" is the default: open jaws at rest earn the same at any distance."""
     still, open_jaws = np.zeros((1, 6)), np.array([0, 0.5, 0.2, 0.5, 0.87, np.pi / 2, 0, 0.0])
     for d in (0.1, 5.0):
-        terms = terms_of(state(q=open_jaws), d, still, "paper")
+        terms = terms_of(state(q=open_jaws), d, still, kind="paper")
         np.testing.assert_allclose(terms[0] + terms[1], 1.0)
         assert terms[3] > 0.6
 
@@ -315,12 +327,12 @@ def test_reward_is_the_sum_of_the_reported_terms(reward):
     envs = CraneVectorEnv(4, reward=reward)
     envs.reset(seed=0)
     _, total, _, _, info = envs.advance(np.full((4, 6), 0.5))
-    terms = [info[f"r_{name}"] for name in ("distance", "grapple", "lift", "balance")]
+    terms = [info[term] for term in crane_env.TERMS]
     np.testing.assert_allclose(total, np.sum(terms, axis=0))
     now = envs.state()
     measured = info["d_combine"], crane_env.log_clearance(now), crane_env.centre_miss(now)
     command = np.tile(0.5 * REAL[1], (4, 1))
-    np.testing.assert_allclose(terms, crane_env.reward_terms(now, *measured, command, reward))
+    np.testing.assert_allclose(terms, crane_env.reward_terms(now, *measured, command, 0.0, reward))
 
 
 def test_time_to_reach_is_the_first_time():

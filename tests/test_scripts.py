@@ -247,7 +247,7 @@ KEYS = """
 charts/SPS charts/simulation_SPS charts/learning_rate charts/gamma charts/updates charts/difficulty
 charts/episodic_return charts/episodic_length charts/success_rate
 losses/value_loss losses/policy_loss losses/entropy losses/explained_variance losses/grad_norm
-reward/distance reward/grapple reward/lift reward/balance
+reward/distance reward/grapple reward/lift reward/balance reward/ground
 termination/diverged termination/joint_limit termination/overspeed termination/log_too_far
 termination/not_reached termination/time_limit time/rollout time/update
 eval/episodic_return eval/success_rate eval/success_rate_0.3m eval/success_rate_0.4m

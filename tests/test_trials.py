@@ -89,7 +89,8 @@ def test_episodes_are_counted_whole():
 
 def step_info(cranes, ended, **values):
     """`info` of a step of three cranes, two of whose terms are 0."""
-    info = {"r_distance": np.zeros(3), "r_balance": np.zeros(3), "termination": np.array(cranes)}
+    info = {"r_distance": np.zeros(3), "r_balance": np.zeros(3), "r_ground": np.zeros(3)}
+    info["termination"] = np.array(cranes)
     if any(ended):
         info["_episode"] = np.array(ended)
     return info | {name: np.zeros(3) + value for name, value in values.items()}
@@ -100,7 +101,7 @@ def test_rollout_report_of_cranes():
     crane = envs.unwrapped
     assert rollout_report(envs, [step_info(["none"] * 3, [False], r_grapple=0, r_lift=0)]) == {
         "charts/difficulty": 1.0,
-        **{f"reward/{name}": 0.0 for name in ("distance", "grapple", "lift", "balance")},
+        **{f"reward/{name}": 0.0 for name in ("distance", "grapple", "lift", "balance", "ground")},
         **{f"termination/{name}": 0.0 for name in crane_env.TERMINATIONS},
     }
     crane.difficulty = 0.35
@@ -127,6 +128,7 @@ def test_rollout_report_of_cranes():
         "reward/grapple": (2 + 0 + 0 + 0) / 4,
         "reward/lift": (0 + 1 + 0 + 0) / 4,
         "reward/balance": 0.0,
+        "reward/ground": 0.0,
         "termination/diverged": 0.0,
         "termination/joint_limit": 0.0,
         "termination/overspeed": 0.25,
