@@ -170,7 +170,7 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
 
 
 def judge(policy: Any, env_id: str, options: dict, args: Args) -> list[dict]:
-    """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m)."""
+    """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m), CARE."""
     diameters, seeds = monte_carlo_trials(args.seed, args.trials, args.diameters)
     records = []
     with tqdm(total=len(seeds), unit="trial", leave=False) as bar:
@@ -192,7 +192,7 @@ def trial_record(end: dict) -> dict:
     failure = end["termination"]
     if failure == "time_limit":
         failure = next((name for name in CONDITIONS if end[name]), "")
-    kept = ("success", "time_to_reach", "centre_miss")
+    kept = ("success", "time_to_reach", "centre_miss", *crane_env.CARE)
     return {name: end[name] for name in kept} | {"failure": failure}
 
 
@@ -217,6 +217,7 @@ def summarize(records: list[dict]) -> list[dict]:
                 "successes": successes,
                 "success_rate": successes / len(trials),
                 "interval": wilson_interval(successes, len(trials)),
+                "gentle_rate": sum(r["gentle"] for r in trials) / len(trials),
                 "failures": dict(Counter(r["failure"] for r in trials if not r["success"])),
             }
         )
@@ -245,6 +246,30 @@ def print_table(records: list[dict], cells: list[dict], noise: str, title: str) 
     print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
     print("Reach is the mean time until d_combine < 0.35 m. Miss is the mean distance from grip to")
     print("log centre, along the log. Both are means over the successes.")
+    print_care(records, cells)
+
+
+def print_care(records: list[dict], cells: list[dict]) -> None:
+    """What the trials cost: medians over all of them, of the time over the successes."""
+    print("\n| d [m] | gentle % | peak [kN] | oil [l] | energy [kJ] | up [s] | swing [rad] |")
+    print("|-------|----------|-----------|---------|-------------|--------|-------------|")
+    rows = [(f"{c['diameter']:<5}", lambda r, d=c["diameter"]: r["diameter"] == d) for c in cells]
+    for name, chosen in [*rows, ("all  ", lambda r: True)]:
+        trials = [r for r in records if chosen(r)]
+        peak, oil, energy, swing = (
+            np.median([r[key] for r in trials])
+            for key in ("ground_peak", "litres", "energy", "swing_peak")
+        )
+        up = [r["time_up"] for r in trials if r["success"]]
+        up = f"{np.median(up):.2f}" if up else ""
+        gentle = 100 * np.mean([r["gentle"] for r in trials])
+        print(
+            f"| {name} | {gentle:<8.1f} | {peak / 1e3:<9.1f} | {oil:<7.2f} | {energy / 1e3:<11.1f} "
+            f"| {up:<6} | {swing:<11.2f} |"
+        )
+    print("Gentle is success without more than 20 kN of the crane on the ground. Peak is that")
+    print("force. Up is the time until the log is safely up. All but gentle are medians, up over")
+    print("the successes.")
 
 
 @contextmanager

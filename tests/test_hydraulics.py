@@ -220,6 +220,83 @@ def test_fuzz_hydraulic():
     assert done > 180_000 and diverged == 0 and warnings == 0
 
 
+# ---- what is counted
+
+
+def test_force_on_the_ground_is_that_of_the_contacts():
+    """A crane that is driven into the ground: peak, impulse and time from each physics step."""
+    envs = CraneVectorEnv(1, frame_skip=1)
+    envs.reset(seed=0)
+    q2, q3, q4 = 0.3, 0.3, 0.5
+    q = np.array([[-1.2, q2, q3, q4, np.pi / 2 - q2 - q3, np.pi / 2, 0, 0.3]])
+    envs.place(np.zeros(1, int), q, FAR_LOG, np.array([0.3]))
+    forces = []
+    for _ in range(800):
+        model, data = envs.batch.get_model(0), envs.batch.get_data(0)
+        _, _, _, _, info = envs.advance(np.array([[0, -0.5, 0, 0, 0, 0]]))
+        data.ctrl[:] = envs.ctrl[0]
+        data.act[:] = envs.act[0] - crane_env.TIMESTEP * envs.ctrl[0, 8:]
+        mujoco.mj_forward(model, data)  # what the step began with
+        total, force = np.zeros(3), np.zeros(6)
+        ground, log = model.geom("ground").id, model.body("log").id
+        for k, contact in enumerate(data.contact):
+            bodies = {model.geom_bodyid[g] for g in contact.geom}
+            if ground in contact.geom and log not in bodies:
+                mujoco.mj_contactForce(model, data, k, force)
+                total += contact.frame.reshape(3, 3).T @ force[:3]
+        forces.append(np.linalg.norm(total))
+    assert max(forces) > 10e3
+    assert info["ground_peak"][0] == pytest.approx(max(forces), rel=0.02)
+    assert info["ground_impulse"][0] == pytest.approx(0.005 * np.sum(forces), rel=0.02)
+    above = 0.005 * np.sum(np.array(forces) > crane_env.GENTLE_FORCE)
+    assert info["ground_time"][0] == pytest.approx(above, abs=0.02)
+
+
+def test_oil_of_a_steady_slew():
+    """Rack and pinion: 6.362e-4 m^3 for each radian."""
+    envs = CraneVectorEnv(1)
+    envs.reset(seed=0)
+    before = envs.qpos[0, 0]
+    for _ in range(20):
+        _, _, _, _, info = envs.advance(np.array([[0.2, 0, 0, 0, 0, 0]]))
+    litres = 1000 * 6.362e-4 * abs(envs.qpos[0, 0] - before)
+    assert info["litres"][0] == pytest.approx(litres, rel=0.05)
+
+
+def test_work_of_lifting_is_the_gained_energy():
+    """A slow boom: what the drives give is potential energy; the pump gives no less."""
+    envs = CraneVectorEnv(1)
+    envs.reset(seed=1)
+
+    def potential():
+        model, data = envs.batch.get_model(0), envs.batch.get_data(0)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_energyPos(model, data)
+        return data.energy[0]
+
+    before = potential()
+    for _ in range(50):
+        _, _, _, _, info = envs.advance(np.array([[0, 0.2, 0, 0, 0, 0]]))
+    gained = potential() - before
+    assert gained > 5e3 and info["work"][0] == pytest.approx(gained, rel=0.1)
+    assert info["energy"][0] > 0.95 * info["work"][0]
+
+
+def test_costs_start_anew_with_an_episode_and_gentle_needs_both(monkeypatch):
+    monkeypatch.setattr(crane_env, "TIME_LIMIT", 0.3)
+    monkeypatch.setattr(crane_env, "REACH_DISTANCE", 100.0)
+    monkeypatch.setattr(crane_env, "HOLD_TIME", 0.1)
+    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 2), bool))
+    envs = CraneVectorEnv(2)
+    envs.reset(seed=0)
+    for _ in range(3):
+        envs.costs["ground_peak"][1] = 20.1e3
+        _, _, _, _, info = envs.step(np.ones((2, 6)))
+    assert info["success"].all() and info["gentle"].tolist() == [True, False]
+    assert (info["litres"] > 0.1).all() and not any(cost.any() for cost in envs.costs.values())
+    assert info["time_up"].tolist() == [0.2, 0.2] and np.isinf(envs.time_up).all()
+
+
 # ---- randomize
 
 
