@@ -132,6 +132,7 @@ LIFT_WEIGHT = 2.0  # largest staged r_lift
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
 NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
+CARRY_WEIGHT = 1.0  # of the log's weight in the jaws, in r_lift: leads to the first lift
 GROUND_WEIGHT = 3.0  # of r_ground at GENTLE_FORCE
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 
@@ -421,6 +422,7 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
+    carried: Array | float = 0.0  # (N,) share of the log's weight that the ground does not carry
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
@@ -498,10 +500,11 @@ def reward_terms(
         r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
         height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
-        lift = np.exp(-((miss / LIFT_MISS) ** 2)) * height
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
         held = state.touching.all(axis=-1)
-        r_lift, r_balance = LIFT_WEIGHT * lift, BALANCE_WEIGHT * calm * held * lift
+        centred = np.exp(-((miss / LIFT_MISS) ** 2))
+        lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
+        r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
         r_ground = -GROUND_WEIGHT * np.minimum(3, ground / GENTLE_FORCE) + r_ground
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
@@ -922,9 +925,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
-        # as in crane.xml; the force on the ground comes last
-        *poses, touch, _ = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14], axis=1)
-        return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0])
+        # as in crane.xml; the crane's force on the ground comes last
+        parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17], axis=1)
+        *poses, touch, support, _ = parts
+        weight = 9.81 * self.batch.body("log").mass[:, 0]
+        carried = np.clip(1 - np.linalg.norm(support, axis=-1) / weight, 0, 1)
+        return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0], carried)
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
         """Observations (N, 18 or 26), float32, inside their space; what `info` says of them."""

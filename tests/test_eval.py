@@ -55,7 +55,9 @@ def test_wilson_interval():
 def test_first_unmet_condition_is_the_failure():
     end = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, "termination": "time_limit"}
     end |= {"not_reached": False, "not_lifted": False, "not_held": True, "off_centre": True}
-    kept = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4}
+    care = {name: float(k) for k, name in enumerate(crane_env.CARE)}
+    end |= care
+    kept = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, **care}
     assert eval_crane.trial_record(end) == {**kept, "failure": "not_held"}
     early = {**end, "termination": "overspeed"}
     assert eval_crane.trial_record(early) == {**kept, "failure": "overspeed"}
@@ -64,12 +66,14 @@ def test_first_unmet_condition_is_the_failure():
 
 
 def test_cells():
-    records = [{"diameter": 0.8, "success": True, "failure": ""}] * 3
-    records += [{"diameter": 0.8, "success": False, "failure": "not_held"}]
-    records += [{"diameter": 0.3, "success": False, "failure": "overspeed"}] * 2
+    records = [{"diameter": 0.8, "success": True, "failure": "", "gentle": False}]
+    records += [{"diameter": 0.8, "success": True, "failure": "", "gentle": True}] * 2
+    records += [{"diameter": 0.8, "success": False, "failure": "not_held", "gentle": False}]
+    records += [{"diameter": 0.3, "success": False, "failure": "overspeed", "gentle": False}] * 2
     thin, thick = eval_crane.summarize(records)
     assert thin["diameter"] == 0.3 and thick["diameter"] == 0.8
     assert thin["successes"] == 0 and thin["failures"] == {"overspeed": 2}
+    assert thin["gentle_rate"] == 0 and thick["gentle_rate"] == 0.5
     assert thick["success_rate"] == 0.75 and thick["failures"] == {"not_held": 1}
     assert thick["trials"] == 4 and thick["interval"] == eval_crane.wilson_interval(3, 4)
 
@@ -103,6 +107,19 @@ def test_both_tables_unless_noise_is_given(run_here, tmp_path):
     assert [row["pose_noise"] for row in rows] == ["none"] * 6 + ["step"] * 6
     one = run_here("--policy", "random", "--trials", "1", "--pose-noise", "episode").out
     assert one.count("| mean") == 1 and "Pose noise: random" in one
+
+
+def test_table_of_costs(capsys):
+    """Medians: of all trials, of the time up over the successes."""
+    trial = {name: 0.0 for name in crane_env.CARE} | {"diameter": 0.5, "failure": ""}
+    good = trial | {"success": True, "gentle": True, "time_up": 4.0, "ground_peak": 1e3}
+    rough = trial | {"success": True, "gentle": False, "time_up": 5.0, "ground_peak": 30e3}
+    bad = trial | {"success": False, "gentle": False, "time_up": np.inf, "ground_peak": 2e3}
+    records = [good | {"litres": 3.0}, rough | {"litres": 5.0}, bad | {"energy": 9e3}]
+    eval_crane.print_care(records, eval_crane.summarize(records))
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if "|" in line]
+    assert [cell.strip() for cell in rows[2]] == "0.5 33.3 2.0 3.00 0.0 4.50 0.00".split()
+    assert [cell.strip() for cell in rows[3]] == "all 33.3 2.0 3.00 0.0 4.50 0.00".split()
 
 
 @pytest.mark.parametrize("algorithm", eval_crane.ALGORITHMS)
@@ -203,7 +220,7 @@ def test_the_contact_model_reported_is_the_one_judged(run_here, monkeypatch):
     def one_failure(policy, env_id, options, args):
         envs = crane_env.make_envs(env_id, 1, **options)
         judged.append(envs.unwrapped.options["contact"])
-        record = {"success": False, "time_to_reach": 1.0, "centre_miss": 0.0}
+        record = {"success": False, "gentle": False, "time_to_reach": 1.0, "centre_miss": 0.0}
         return [{"diameter": 0.5, "failure": "overspeed", **record}]
 
     monkeypatch.setattr(eval_crane, "judge", one_failure)

@@ -136,6 +136,18 @@ def test_staged_reward():
     np.testing.assert_allclose(terms[1], 1.0)  # nearer than 0.35 m is no better for r_grapple
 
 
+def test_carrying_the_log_pays_before_it_rises():
+    """With both jaws, near the centre: leads to the first lift of a heavy log."""
+    down = state(log_centre=[4.0, 6.0, 0.2], grapple_centre=[4.0, 6.0, 0.4], touching=[True, True])
+    for share in (0.0, 0.5, 1.0):
+        lift = terms_of(down._replace(carried=np.array([share])), 0.4, COMMAND)[2]
+        assert lift == pytest.approx(share, abs=1e-3)
+    one_jaw = down._replace(carried=np.ones(1), touching=np.array([[True, False]]))
+    assert terms_of(one_jaw, 0.4, COMMAND)[2] == pytest.approx(0, abs=1e-3)
+    off = down._replace(carried=np.ones(1), grapple_centre=np.array([[4.0, 6.25, 0.4]]))
+    assert terms_of(off, 0.4, COMMAND)[2] == pytest.approx(np.exp(-1), abs=1e-3)
+
+
 def test_hitting_the_ground_costs():
     """In proportion to the force, up to three times the gentle one; nothing in the paper's form."""
     here = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1])
