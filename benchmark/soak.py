@@ -1,6 +1,6 @@
 """Long and hostile runs: nothing may hang, leak, diverge, lose work or end in a traceback.
 
-    python benchmark/soak.py steps       # ten million steps, one million with sdf; 20 minutes
+    python benchmark/soak.py steps       # ten million of each drive, one million with sdf; 40 minutes
     python benchmark/soak.py memory      # four simulated hours of one crane; 3 minutes
     python benchmark/soak.py kills       # ten kill -9, each with a resume; 2 minutes
     python benchmark/soak.py arguments   # each argument of each script, absurd values; 15 minutes
@@ -53,11 +53,16 @@ def steps() -> list[Row]:
     """
     policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
     rows = []
-    for contact, amount in (("primitive", 10_000_000), ("sdf", 1_000_000)):
-        envs = CraneVectorEnv(CRANES, contact=contact, frame_skip=1)
+    for actuators, contact, amount in (
+        ("ideal", "primitive", 10_000_000),
+        ("hydraulic", "primitive", 10_000_000),
+        ("ideal", "sdf", 1_000_000),
+    ):
+        what = {"actuators": actuators, "contact": contact}
+        envs = CraneVectorEnv(CRANES, frame_skip=1, **what)
         rng, failures, lifted = np.random.default_rng(0), 0, 0
         obs, _ = envs.reset(seed=0)
-        for k in tqdm(range(amount // CRANES), desc=contact):
+        for k in tqdm(range(amount // CRANES), desc=f"{actuators}, {contact}"):
             if k % 20 == 0:
                 actions = rng.uniform(-1, 1, (CRANES, 6))
                 actions[::4] = np.sign(actions[::4])
@@ -67,7 +72,9 @@ def steps() -> list[Row]:
             failures += (obs not in envs.observation_space) + (~np.isfinite(reward)).sum()
             lifted += info["success"].sum()
         failures += envs.batch.warning[:, :, 1].sum()
-        rows.append((f"{contact} contact", amount, "steps", int(failures), f"{lifted} logs lifted"))
+        rows.append(
+            (f"{actuators}, {contact}", amount, "steps", int(failures), f"{lifted} logs lifted")
+        )
     return rows
 
 

@@ -20,9 +20,19 @@ def choices(name):
     return st.sampled_from(get_args(annotation) or (False, True))
 
 
-literals = ["reward", "speed", "offset", "signed_yaw", "axes", "pose_noise", "curriculum"]
+literals = [
+    "actuators",
+    "rates",
+    "reward",
+    "speed",
+    "offset",
+    "signed_yaw",
+    "axes",
+    "pose_noise",
+    "curriculum",
+]
 engine = ["integrator", "solver"]
-shares = {name: st.floats(0, 1) for name in ("difficulty", "retry")}
+shares = {name: st.floats(0, 1) for name in ("difficulty", "retry", "randomize")}
 options = st.fixed_dictionaries(
     {},
     optional={name: choices(name) for name in literals + engine}
