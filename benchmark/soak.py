@@ -1,6 +1,6 @@
 """Long and hostile runs: nothing may hang, leak, diverge, lose work or end in a traceback.
 
-    python benchmark/soak.py steps       # ten million of each drive, one million with sdf; 40 minutes
+    python benchmark/soak.py steps       # ten million each, one million with sdf; 40 minutes
     python benchmark/soak.py memory      # four simulated hours of one crane; 3 minutes
     python benchmark/soak.py kills       # ten kill -9, each with a resume; 2 minutes
     python benchmark/soak.py arguments   # each argument of each script, absurd values; 15 minutes
