@@ -102,6 +102,7 @@ def test_a_run_ends_at_the_first_weight_that_is_not_finite(
     assert scalars(only_run(tmp_path))["charts/updates"][-1] <= 11
 
 
+@pytest.mark.filterwarnings("ignore:.*reward is a NaN")
 def test_a_reward_that_is_not_finite_ends_the_run(tmp_path, run_here, monkeypatch):
     import recall_env
 
