@@ -121,9 +121,8 @@ LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre
 LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.012 rad or 0.016 m
 HOLD_TIME = 0.5  # s at the end of an episode in which the log must be held
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
-GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.5 kN
-MAX_PRESSURE = 25e6  # Pa, of the pump
 MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
+GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.5 kN
 
 OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give it
@@ -132,9 +131,9 @@ LIFT_WEIGHT = 2.0  # largest staged r_lift
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
 NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
-CARRY_WEIGHT = 1.0  # of the log's weight in the jaws, in r_lift: leads to the first lift
-GROUND_WEIGHT = 3.0  # of r_ground at GENTLE_FORCE
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
+CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
+GROUND_WEIGHT = 3.0  # what r_ground takes away at GENTLE_FORCE
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
@@ -153,14 +152,15 @@ BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes t
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
 PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
+MAX_PRESSURE = 25e6  # Pa, of the pump
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
-# The telescope extends with the oil of its rod side; q8 moves its cylinder 0.292 m in 3 rad.
+# The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
 OIL = np.array(
     [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
      [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
-# What randomize=1 draws uniformly at each start: what is nominal, lowest, highest. Per joint:
-# q1, q2, q3, each telescope stage, q7, q8. The bands are those of the identification.
+# What randomize=1 draws uniformly at each start: nominal, lowest and highest value. Six numbers
+# belong to q1, q2, q3, each telescope stage, q7 and q8. assets/README.md has the sources.
 DRAWN = {
     "stiffness": (
         STIFFNESS,
@@ -201,7 +201,7 @@ CARE = ["gentle", *COSTS, "time_up", "log_speed"]
 RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
 RESULTS |= {*CONDITIONS, *CARE}
 Array = np.ndarray
-ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()
+ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
 LOCKS: list[FileLock] = []  # of the folders in which this process trains
 
 
@@ -372,6 +372,13 @@ def cylinder_levers(q2: Array, q3: Array) -> Array:
     step = 1e-4
     levers = [(f(q + step) - f(q - step)) / (2 * step) for f, q in ((boom, q2), (arm, q3))]
     return np.array(levers)
+
+
+def oil_per_movement(q: Array, dq: Array) -> Array:
+    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6)."""
+    oil = np.where(dq < 0, OIL[0], OIL[1])
+    oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+    return oil
 
 
 def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
@@ -641,7 +648,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             for name, (nominal, _, _) in DRAWN.items()
         }
 
-        self.command = np.zeros((self.num_envs, 6))  # rad/s, m/s, of the last decision
         self.opening = np.zeros((self.num_envs, 6))  # rad/s, m/s, what the valves let through
         self.telescope_wait = np.zeros(self.num_envs)  # s since a resting telescope was commanded
         self.hit = np.zeros(self.num_envs)  # N, largest force on the ground in the last decision
@@ -726,7 +732,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("actions must be finite, got NaN or infinity")
         actions = np.clip(actions, -1, 1)
         command = np.where(actions < 0, -actions * self.speed[0], actions * self.speed[1])
-        self.command = command
         diverged = self.simulate(command)
         self.decisions += 1
 
@@ -813,8 +818,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         ground = np.linalg.norm(self.ground_force.reshape(-1, 5, 3), axis=-1)
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
         force = self.drive_force[:, SERVOS] @ np.eye(6)[COMMAND_OF_SERVO]  # of both stages, jaws
-        oil = np.where(dq < 0, OIL[0], OIL[1])
-        oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+        oil = oil_per_movement(q, dq)
         flow = np.sum(oil * np.abs(dq), axis=-1)
         pressure = np.clip(force * np.sign(dq) / oil, 0, MAX_PRESSURE).max(axis=-1)
         swing = np.hypot(q[:, 4] - np.pi / 2 + q[:, 1] + q[:, 2], q[:, 5] - np.pi / 2)
@@ -845,8 +849,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         decay = np.exp(-seconds / LAG)
         mean = target + (opening - target) * LAG / seconds * (1 - decay)
         self.opening[ids] = target + (opening - target) * decay
-        oil = np.where(mean < 0, OIL[0], OIL[1])
-        oil[:, 1:3] *= cylinder_levers(self.qpos[ids, 1], self.qpos[ids, 2]).T
+        oil = oil_per_movement(self.qpos[ids], mean)
         demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
         return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
 
@@ -899,7 +902,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
         self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp[ids]
-        self.command[ids] = self.opening[ids] = self.telescope_wait[ids] = 0
+        self.opening[ids] = self.telescope_wait[ids] = 0
         self.decisions[ids] = 0
         self.reach_time[ids] = self.time_up[ids] = np.inf
         for cost in (self.hit, *self.costs.values()):

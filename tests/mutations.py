@@ -197,6 +197,62 @@ MUTATIONS = [
         "pass",
         "test_env -k next_step",
     ),
+    Mutation(
+        "all joints get the oil that they ask for",
+        ("crane_env.py",),
+        "return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))",
+        "return mean",
+        "test_hydraulics -k pump",
+    ),
+    Mutation(
+        "the telescope opens at once",
+        ("crane_env.py",),
+        "target[closed, 3] = 0.0",
+        "pass",
+        "test_hydraulics -k telescope",
+    ),
+    Mutation(
+        "valves have no lag",
+        ("crane_env.py",),
+        "self.opening[ids] = target + (opening - target) * decay",
+        "self.opening[ids] = target",
+        "test_hydraulics -k lag",
+    ),
+    Mutation(
+        "valves look too often at a short frame_skip",
+        ("crane_env.py",),
+        "ids = np.flatnonzero(due)",
+        "ids = np.arange(self.num_envs)",
+        "test_hydraulics -k frame_skip",
+    ),
+    Mutation(
+        "the drawn speed gain is ignored",
+        ("crane_env.py",),
+        "command = command * np.where(command < 0, gain[:, 0], gain[:, 1])",
+        "pass",
+        "test_hydraulics -k gain",
+    ),
+    Mutation(
+        "one jaw is enough to carry",
+        ("crane_env.py",),
+        "CARRY_WEIGHT * centred * held * state.carried",
+        "CARRY_WEIGHT * centred * state.carried",
+        "test_rules -k carrying",
+    ),
+    Mutation(
+        "gentle ignores the force",
+        ("crane_env.py",),
+        'info["success"] & (info["ground_peak"] <= GENTLE_FORCE)',
+        'info["success"]',
+        "test_hydraulics -k gentle",
+    ),
+    Mutation(
+        "costs go on in the next episode",
+        ("crane_env.py",),
+        "            cost[ids] = 0.0\n",
+        "            pass\n",
+        "test_hydraulics -k costs",
+    ),
 ]
 
 
