@@ -11,7 +11,7 @@ Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as print
 `ForestryCraneHydraulic-v0` the same crane with the drives that were measured on the machine.
 Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
 
-Observation, float32, `Box` of shape (18,), with rates (26,):
+Observation, float32, `Box` of shape (18,), with sensors (32,):
 
 | index | meaning                                          | unit  | low     | high   |
 |-------|--------------------------------------------------|-------|---------|--------|
@@ -41,8 +41,14 @@ Observation, float32, `Box` of shape (18,), with rates (26,):
 | 23    | last command of q8                               | 1     | -1      | 1      |
 | 24    | q5 velocity                                      | rad/s | -10     | 10     |
 | 25    | q6 velocity                                      | rad/s | -10     | 10     |
+| 26    | force of the oil on q1, fraction of its limit    | 1     | -1      | 1      |
+| 27    | force of the oil on q2                           | 1     | -1      | 1      |
+| 28    | force of the oil on q3                           | 1     | -1      | 1      |
+| 29    | force of the oil on q4                           | 1     | -1      | 1      |
+| 30    | force of the oil on q7                           | 1     | -1      | 1      |
+| 31    | force of the oil on q8                           | 1     | -1      | 1      |
 
-Indices 18 to 25 exist with rates=True only, as in `ForestryCraneHydraulic-v0`. With
+Indices 18 to 31 exist with sensors=True only, as in `ForestryCraneHydraulic-v0`. With
 signed_yaw=False index 17 is the paper's Delta_psi, without unit.
 
 Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
@@ -60,21 +66,18 @@ direction. 0 stops the joint; values outside the box are clipped.
 
 import ctypes
 import ctypes.util
-import importlib
 import os
 import sys
-import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import NoneType, TracebackType
+from types import NoneType
 from typing import (
     Annotated,
     Any,
     Literal,
     NamedTuple,
-    TextIO,
     TypedDict,
     Unpack,
     get_args,
@@ -89,19 +92,20 @@ if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
 import gymnasium
 import mujoco
 import numpy as np
-from filelock import FileLock, Timeout
-from gymnasium.envs.registration import EnvSpec, load_env_creator
+from filelock import FileLock
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from mujoco.batch import Batch, SimulationError
 from numpy.random import Generator, SeedSequence, default_rng
+
+from machine import DRAWN, MAX_PRESSURE, VALVE_STEPS, Valves, install_drives, oil_per_movement
 
 # ---- constants
 
 HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
-REVISION = 6  # of the task; raise it when a change makes trained policies worse
+REVISION = 7  # of the task; raise it when a change makes trained policies worse
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. V)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
 SDF_INITPOINTS, SDF_ITERATIONS = 8, 5  # of each search for SDF contacts (assets/README.md)
@@ -133,57 +137,13 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 3.0  # what r_ground takes away at GENTLE_FORCE
+GROUND_WEIGHT = 5.0  # what r_ground takes away at GENTLE_FORCE, from nothing at half of it
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
         [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
     ),
     "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
-}
-# The machine's drives: q1, q2, q3, each telescope stage, q7, q8 (assets/README.md). Oil drives a
-# joint like a spring whose rest position moves at the commanded speed.
-STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 5.0e4])  # N m/rad, N/m
-DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 1300.0])  # N m s/rad, N s/m
-MAX_FORCE = np.array([3.181e4, 2e5, 1e5, 5e4, 2.2e3, 1.2e4])  # N m, N
-LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.06])  # s, of the valve, first order
-DEAD_TIME = np.array([0.117, 0.081, 0.044, 0.060, 0.058, 0.060])  # s
-BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
-MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
-VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
-PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
-MAX_PRESSURE = 25e6  # Pa, of the pump
-# Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
-# The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
-OIL = np.array(
-    [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
-     [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
-)  # fmt: skip
-# What randomize=1 draws uniformly at each start: nominal, lowest and highest value. Six numbers
-# belong to q1, q2, q3, each telescope stage, q7 and q8. assets/README.md has the sources.
-DRAWN = {
-    "stiffness": (
-        STIFFNESS,
-        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 2.5e4]),
-        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 7.5e4]),
-    ),
-    "damping": (
-        DAMPING,
-        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 650.0]),
-        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 2600.0]),
-    ),
-    "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
-    "gain": (  # factor on the speed, of movements down and up
-        np.ones((2, 6)),
-        np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
-        np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
-    ),
-    "density": (LOG_DENSITY, 450.0, 950.0),  # kg/m^3
-    "friction": (1.0, 0.5, 1.5),  # factor on that of all surfaces
-    "pose_error": (np.zeros(3), np.full(3, -0.057), np.full(3, 0.057)),  # m, 0.1 m at most
-    "yaw_error": (0.0, -0.1745, 0.1745),  # rad
-    "joint_error": (np.zeros(8), -0.0087 * (np.arange(8) != 3), 0.0087 * (np.arange(8) != 3)),
-    "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
 }
 # The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
@@ -269,7 +229,7 @@ class Options(TypedDict, total=False):
     frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (20)
     actuators: Literal["ideal", "hydraulic"]  # servos, or the machine's own drives (ideal)
     randomize: Share  # width of the random errors of drives, log and sensors (0.0)
-    rates: bool  # also observe the last command and the rates of q5 and q6 (False)
+    sensors: bool  # also observe last command, rates of q5 and q6, oil forces (False)
     contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
     reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
     speed: Literal["real", "mjcf"]  # joint speed limits (real)
@@ -285,7 +245,7 @@ class Options(TypedDict, total=False):
 
 
 DEFAULTS = Options(
-    frame_skip=20, actuators="ideal", randomize=0.0, rates=False, contact="primitive",
+    frame_skip=20, actuators="ideal", randomize=0.0, sensors=False, contact="primitive",
     reward="staged", speed="real", offset="plus", signed_yaw=True, axes="crane",
     pose_noise="none", difficulty=1.0, curriculum=False, retry=0.0, integrator="implicitfast",
     solver="Newton",
@@ -294,7 +254,7 @@ PAPER = Options(  # ForestryCranePaper-v0
     frame_skip=1, contact="sdf", reward="paper", offset="minus", signed_yaw=False, axes="world",
     integrator="implicit", solver="CG",
 )  # fmt: skip
-HYDRAULIC = Options(actuators="hydraulic", rates=True)  # ForestryCraneHydraulic-v0
+HYDRAULIC = Options(actuators="hydraulic", sensors=True)  # ForestryCraneHydraulic-v0
 
 
 def complete(options: Options) -> Options:
@@ -334,51 +294,9 @@ def load_model(
             elif geom.classname.name == "jaw_collision":
                 geom.conaffinity &= ~4
     if actuators == "hydraulic":
-        for servo, command in zip(SERVOS, COMMAND_OF_SERVO):
-            joint = spec.joints[servo]
-            joint.damping[0] = DAMPING[command]
-            joint.actfrcrange = [-MAX_FORCE[command], MAX_FORCE[command]]
-            spec.actuator(joint.name).gainprm[0] = spec.actuator(joint.name).biasprm[2] = 0
-            drive = spec.actuator(f"{joint.name}_integral")
-            drive.gainprm[0], drive.biasprm[1] = STIFFNESS[command], -STIFFNESS[command]
-            drive.delay, drive.nsample = DEAD_TIME[command], MAX_DELAY
-        for name, damping, friction in (("q5", 15.0, 10.0), ("q6", 20.0, 5.0)):
-            spec.joint(name).damping[0], spec.joint(name).frictionloss = damping, friction
+        install_drives(spec, SERVOS, COMMAND_OF_SERVO)
     spec.compiler.discardvisual = not visual
     return spec.compile()
-
-
-def cylinder_levers(q2: Array, q3: Array) -> Array:
-    """Metres that boom and arm cylinder lengthen per radian of q2 and q3, (2, N).
-
-    The arm's cylinder pushes the arm itself. The boom's pushes the joint of two bars, 0.57 m to
-    the column and 0.124 m to the boom.
-    """
-
-    def boom(q: Array) -> Array:
-        x, y = 0.4539 * np.cos(q) + 0.036 * np.sin(q) + 0.12, 0.4539 * np.sin(q) - 0.036 * np.cos(q)
-        y = y + 0.07  # from the bars' pivot on the column to that on the boom
-        apart = np.hypot(x, y)
-        along = (0.57**2 - 0.124**2 + apart**2) / (2 * apart)
-        across = np.sqrt(np.maximum(0.57**2 - along**2, 0))
-        foot_x, foot_y = 0.553, -1.6982  # of the cylinder, from the same pivot
-        knee_x, knee_y = (along * x + across * y) / apart, (along * y - across * x) / apart
-        return np.hypot(knee_x - foot_x, knee_y - foot_y)
-
-    def arm(q: Array) -> Array:
-        x, y = -0.118 * np.cos(q) + 0.468 * np.sin(q), -0.118 * np.sin(q) - 0.468 * np.cos(q)
-        return np.hypot(x + 1.6802, y + 0.0485)
-
-    step = 1e-4
-    levers = [(f(q + step) - f(q - step)) / (2 * step) for f, q in ((boom, q2), (arm, q3))]
-    return np.array(levers)
-
-
-def oil_per_movement(q: Array, dq: Array) -> Array:
-    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6)."""
-    oil = np.where(dq < 0, OIL[0], OIL[1])
-    oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
-    return oil
 
 
 def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
@@ -512,7 +430,7 @@ def reward_terms(
         centred = np.exp(-((miss / LIFT_MISS) ** 2))
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
-        r_ground = -GROUND_WEIGHT * np.minimum(3, ground / GENTLE_FORCE) + r_ground
+        r_ground = -GROUND_WEIGHT * np.clip(2 * ground / GENTLE_FORCE - 1, 0, 1) + r_ground
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 
@@ -648,8 +566,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             for name, (nominal, _, _) in DRAWN.items()
         }
 
-        self.opening = np.zeros((self.num_envs, 6))  # rad/s, m/s, what the valves let through
-        self.telescope_wait = np.zeros(self.num_envs)  # s since a resting telescope was commanded
+        self.valves = Valves(self.num_envs)
         self.hit = np.zeros(self.num_envs)  # N, largest force on the ground in the last decision
         self.costs = {name: np.zeros(self.num_envs) for name in COSTS}
         self.time_up = np.full(self.num_envs, np.inf)  # s
@@ -665,8 +582,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
         bound = np.repeat([10.0, 20.0, 1.5 * np.pi], [6, 3, 1])  # dq, Delta_p, its angle
-        if options["rates"]:
-            bound = np.append(bound, np.repeat([1.0, 10.0], [6, 2]))  # command, dq5 and dq6
+        if options["sensors"]:
+            bound = np.append(bound, np.repeat([1.0, 10.0, 1.0], [6, 2, 6]))
         bounds = np.float32([[*low, *-bound], [*high, *bound]])
         self.single_observation_space = gymnasium.spaces.Box(*bounds)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
@@ -796,8 +713,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             nstep = min(piece, self.frame_skip - start)
             if self.hydraulic:
                 ids = np.flatnonzero(due)
-                flow = self.valves(ids, command[ids], nstep * every * TIMESTEP)
-                self.ctrl[ids, 8:] = flow[:, COMMAND_OF_SERVO]
+                gain = np.where(command < 0, self.drawn["gain"][:, 0], self.drawn["gain"][:, 1])
+                wanted, seconds = (gain * command)[ids], nstep * every * TIMESTEP
+                speed = self.valves.mean_speed(ids, wanted, self.qpos[ids], seconds)
+                self.ctrl[ids, 8:] = speed[:, COMMAND_OF_SERVO]
             # sensors are needed after the last physics step only
             last = start + nstep == self.frame_skip
             stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
@@ -831,27 +750,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         costs["energy"] += flow * pressure * seconds
         costs["work"] += np.sum(np.abs(force * dq), axis=-1) * seconds
         costs["swing_peak"] = np.maximum(costs["swing_peak"], swing)
-
-    def valves(self, ids: Array, command: Array, seconds: float) -> Array:
-        """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
-
-        A valve follows its command as a first-order lag. A resting telescope's load-holding valve
-        opens late. If all joints ask for more oil than the pump gives, all get the same share.
-        """
-        gain = self.drawn["gain"][ids]
-        command = command * np.where(command < 0, gain[:, 0], gain[:, 1])
-        opening, telescope = self.opening[ids], command[:, 3]
-        resting = (np.abs(opening[:, 3]) < 1e-3) & (telescope != 0)
-        self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
-        closed = resting & (self.telescope_wait[ids] <= BREAKAWAY)
-        target = command.copy()
-        target[closed, 3] = 0.0
-        decay = np.exp(-seconds / LAG)
-        mean = target + (opening - target) * LAG / seconds * (1 - decay)
-        self.opening[ids] = target + (opening - target) * decay
-        oil = oil_per_movement(self.qpos[ids], mean)
-        demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
-        return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
 
     def start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
         """New episodes in cranes `ids`; observations and info of all cranes."""
@@ -902,7 +800,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
         self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp[ids]
-        self.opening[ids] = self.telescope_wait[ids] = 0
+        self.valves.close(ids)
         self.decisions[ids] = 0
         self.reach_time[ids] = self.time_up[ids] = np.inf
         for cost in (self.hit, *self.costs.values()):
@@ -936,7 +834,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0], carried)
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
-        """Observations (N, 18 or 26), float32, inside their space; what `info` says of them."""
+        """Observations (N, 18 or 32), float32, inside their space; what `info` says of them."""
         delta_p, delta_psi, signed_angle = relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
         clearance, miss = log_clearance(state), centre_miss(state)
@@ -957,9 +855,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
         parts = [q, state.dq, delta_p, angle[:, None]]
-        if self.options["rates"]:
+        if self.options["sensors"]:
             limit = np.where(command < 0, -self.speed[0], self.speed[1])
-            parts += [command / limit, self.qvel[:, JOINTS][:, PASSIVE]]
+            lead = (self.act - self.qpos[:, SERVOS]) / self.max_lead
+            force = np.clip(lead[:, [0, 1, 2, 3, 5, 6]], -1, 1)
+            parts += [command / limit, self.qvel[:, JOINTS][:, PASSIVE], force]
         obs = np.concatenate(parts, axis=-1)
         obs[np.isnan(obs)] = 0  # of a crane that diverged
         space = self.single_observation_space
@@ -1093,157 +993,3 @@ CLASSES = {"entry_point": "crane_env:CraneEnv", "vector_entry_point": "crane_env
 gymnasium.register("ForestryCrane-v0", **CLASSES)
 gymnasium.register("ForestryCranePaper-v0", kwargs=PAPER, **CLASSES)
 gymnasium.register("ForestryCraneHydraulic-v0", kwargs=HYDRAULIC, **CLASSES)
-
-
-# ---- training and judging
-
-
-def one_line_errors(hint: str = "") -> None:
-    """From now on, files that cannot be used and Ctrl-C end with one line and no traceback.
-
-    hint follows a file's error. All other errors keep their traceback.
-    """
-
-    def report(kind: type, error: BaseException, trace: TracebackType | None) -> None:
-        if issubclass(kind, KeyboardInterrupt):
-            say("\ninterrupted", sys.stderr)
-        elif issubclass(kind, OSError):
-            say(f"\n{kind.__name__}: {error}{hint}", sys.stderr)
-        else:
-            sys.__excepthook__(kind, error, trace)
-        if issubclass(kind, BrokenPipeError):
-            say("", sys.stdout)
-
-    def report_of_thread(args: threading.ExceptHookArgs) -> None:
-        # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
-        if not issubclass(args.exc_type, OSError):
-            threading.__excepthook__(args)
-
-    sys.excepthook, threading.excepthook = report, report_of_thread
-
-
-def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line, unless the terminal or the pipe is closed. Then nothing more goes there."""
-    stream = stream or sys.stdout
-    try:
-        print(line, file=stream, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def lock_folder(folder: Path) -> None:
-    """Make a run's folder and hold its lock until the process ends. SystemExit if another does."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / "lock", blocking=False)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise SystemExit(f"another process trains in {folder}") from None
-    LOCKS.append(lock)
-
-
-def is_crane(env_id: str) -> bool:
-    """Whether the task is this crane or a subclass of it: `CraneVectorEnv` steps it."""
-    module, _, name = env_id.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    creator = gymnasium.spec(name).vector_entry_point
-    creator = load_env_creator(creator) if isinstance(creator, str) else creator
-    return isinstance(creator, type) and issubclass(creator, CraneVectorEnv)
-
-
-def make_envs(
-    env_id: str, num_envs: int, env_threads: int = 0, **options: Any
-) -> gymnasium.vector.VectorEnv:
-    """N environments of any Gymnasium task, with SAME_STEP autoreset and `info["episode"]`.
-
-    env_threads and options are the crane's. Other tasks refuse options. They ignore only retry,
-    which some scripts set by default.
-    """
-    if is_crane(env_id):
-        envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)
-    elif unknown := options.keys() - {"retry"}:
-        raise ValueError(f"{env_id} is not the crane and has no option {', '.join(unknown)}")
-    else:
-        autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        envs = gymnasium.make_vec(env_id, num_envs, "sync", vector_kwargs=autoreset)
-    for space in (envs.single_observation_space, envs.single_action_space):
-        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            raise ValueError("its observations or actions are no flat Box")
-    return RecordEpisodeStatistics(envs)
-
-
-def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[str, float]:
-    """What TensorBoard shows of a rollout of `make_envs`, from the `info` of each of its steps."""
-    report, crane = {}, envs.unwrapped
-    ends = [(info, i) for info in infos if "episode" in info for i in info["_episode"].nonzero()[0]]
-    if ends:
-        report["charts/episodic_return"] = np.mean([info["episode"]["r"][i] for info, i in ends])
-        report["charts/episodic_length"] = np.mean([info["episode"]["l"][i] for info, i in ends])
-    if isinstance(crane, CraneVectorEnv):
-        if crane.recent_success:
-            report["charts/success_rate"] = np.mean(crane.recent_success)
-        report["charts/difficulty"] = crane.difficulty
-        report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
-        endings = [info["termination"][i] for info, i in ends]
-        for name in TERMINATIONS:
-            report[f"termination/{name}"] = endings.count(name) / max(1, len(endings))
-    return report
-
-
-def monte_carlo_trials(
-    seed: int, trials: int, diameters: Sequence[float] = DIAMETERS
-) -> tuple[Array, list[SeedSequence]]:
-    """Diameters (m) and seeds of trials per diameter, for `CraneVectorEnv` and its `reset`.
-
-    Trial k at a diameter is the same whatever the number of trials and the other diameters.
-    """
-    keys = [(round(1000 * d), k) for d in diameters for k in range(trials)]
-    return np.repeat(diameters, trials), [SeedSequence(seed, spawn_key=key) for key in keys]
-
-
-def run_trials(
-    policy: Any, envs: gymnasium.vector.VectorEnv, seeds: Any, deterministic: bool = True
-) -> dict[str, Array]:
-    """One whole episode in each environment of `make_envs`: RESULTS, (N,) each.
-
-    policy.predict(obs (N, obs_dim), state, deterministic=...) returns actions (N, act_dim) and the
-    next state. The first state is None. Stable-Baselines3's models have this method too.
-    """
-    names = RESULTS if isinstance(envs.unwrapped, CraneVectorEnv) else {"episodic_return"}
-    obs, _ = envs.reset(seed=seeds)
-    results, state, ended = {}, None, np.zeros(envs.num_envs, bool)
-    while not ended.all():
-        actions, state = policy.predict(obs, state, deterministic=deterministic)
-        obs, _, terminated, truncated, info = envs.step(actions)
-        first = (terminated | truncated) & ~ended  # later ends belong to other episodes
-        if first.any():
-            info["episodic_return"] = info["episode"]["r"]
-            for name in names:
-                results.setdefault(name, np.zeros_like(info[name]))[first] = info[name][first]
-        ended |= first
-    return results
-
-
-def evaluate(
-    policy: Any, env_id: str, trials: int, seed: int, env_threads: int = 0, **options: Any
-) -> dict[str, float]:
-    """Mean return and success rates in trials per diameter (other tasks: trials in all).
-
-    These are trials of the full task. They set diameter, difficulty, curriculum and retry.
-    """
-    crane = is_crane(env_id)
-    if crane:
-        diameters, seeds = monte_carlo_trials(seed, trials)
-        options |= {"diameter": diameters, "retry": 0.0, "curriculum": False, "difficulty": 1.0}
-        envs = make_envs(env_id, len(seeds), env_threads, **options)
-    else:
-        envs, seeds = make_envs(env_id, trials, **options), seed
-    results = run_trials(policy, envs, seeds)
-    envs.close()
-    scores = {"episodic_return": results["episodic_return"].mean().item()}
-    if crane:
-        scores["success_rate"] = results["success"].mean().item()
-        for d in DIAMETERS:
-            scores[f"success_rate_{d}m"] = results["success"][diameters == d].mean().item()
-    return scores

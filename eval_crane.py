@@ -30,6 +30,7 @@ import tyro
 from tqdm import tqdm
 
 import crane_env
+import crane_trials
 import mppo_beta_crane
 import ppo_crane
 import recurrent_ppo_crane
@@ -42,10 +43,8 @@ from crane_env import (
     Range,
     Seed,
     Threads,
-    make_envs,
-    monte_carlo_trials,
-    run_trials,
 )
+from crane_trials import make_envs, monte_carlo_trials, run_trials
 from scripted_crane import ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
@@ -147,7 +146,7 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     """The task's id and options to judge on, with a warning where it is not the policy's own."""
     env_id = args.env_id or trained_on["env_id"]
     try:
-        on_crane = crane_env.is_crane(env_id)
+        on_crane = crane_trials.is_crane(env_id)
     except Exception as error:  # an unknown id or module raises many kinds
         raise SystemExit(f"--env-id {env_id}: {error}") from None
     if not on_crane:
@@ -155,7 +154,7 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "curriculum", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
     if args.policy == "file":
-        options["rates"] = trained_on["rates"]  # what its networks read
+        options["sensors"] = trained_on["sensors"]  # what its networks read
     options |= {"contact": args.contact} if args.contact else {}
     if args.policy == "scripted":
         options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}
@@ -372,7 +371,7 @@ def check_combinations(args: Args) -> None:
 
 
 def main() -> None:
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     check_combinations(args)
     task = {"env_id": "ForestryCrane-v0"}

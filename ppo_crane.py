@@ -45,6 +45,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import crane_env
+import crane_trials
 from crane_env import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
 
 ALGORITHM = "ppo"
@@ -191,7 +192,7 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
     path = folder / "checkpoint.pt"
     if not path.is_file():
         raise SystemExit(f"--resume: there is no {path}")
-    crane_env.lock_folder(folder)
+    crane_trials.lock_folder(folder)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         task, algorithm = checkpoint["task"], checkpoint["algorithm"]
@@ -215,7 +216,7 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
 
 
 if __name__ == "__main__":
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     checkpoint = None
     if args.resume is not None:
@@ -237,7 +238,7 @@ if __name__ == "__main__":
 
     # Environments
     try:
-        envs = crane_env.make_envs(args.env_id, args.num_envs, args.env_threads, **args.env)
+        envs = crane_trials.make_envs(args.env_id, args.num_envs, args.env_threads, **args.env)
     except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -263,7 +264,7 @@ if __name__ == "__main__":
     run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
     run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
     if args.resume is None:
-        crane_env.lock_folder(run_dir)
+        crane_trials.lock_folder(run_dir)
     writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
     writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
     task = {"env_id": args.env_id, **(envs.unwrapped.task if is_crane else {})}
@@ -288,11 +289,11 @@ if __name__ == "__main__":
             (run_dir / f"{name}.tmp").write_bytes(buffer.getvalue())
             os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
         # from now on an error can say how to go on
-        crane_env.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
+        crane_trials.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
 
     def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
         protocol = {"trials": trials, "seed": args.eval_seed, "env_threads": args.env_threads}
-        scores = crane_env.evaluate(agent, args.env_id, **protocol, **args.env)
+        scores = crane_trials.evaluate(agent, args.env_id, **protocol, **args.env)
         for key, value in scores.items():
             writer.add_scalar(f"{name}/{key}", value, iteration * batch_size)
         return scores
@@ -315,7 +316,7 @@ if __name__ == "__main__":
             save(iteration)
         if stopping:
             progress.close()
-            crane_env.say(f"stopped after update {iteration}; go on with --resume {run_dir}")
+            crane_trials.say(f"stopped after update {iteration}; go on with --resume {run_dir}")
             raise SystemExit(128 + stop_signals[0])
         progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
@@ -419,7 +420,7 @@ if __name__ == "__main__":
         sps = batch_size / (now - rollout_start)
         report = {"charts/updates": iteration}
         report |= {name: np.mean(values) for name, values in stats.items()}
-        report |= crane_env.rollout_report(envs, infos)
+        report |= crane_trials.rollout_report(envs, infos)
         report["losses/explained_variance"] = (
             1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
         )

@@ -9,7 +9,7 @@
 
     model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
     model.learn(100_000)
-    print(crane_env.evaluate(model, "ForestryCrane-v0", trials=100, seed=40_000))
+    print(crane_trials.evaluate(model, "ForestryCrane-v0", trials=100, seed=40_000))
 
 SB3 wraps `gymnasium.make("ForestryCrane-v0")` itself, one crane at a time. This is faster: all
 cranes are simulated together.
@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-import crane_env
+import crane_trials
 
 
 class CraneVecEnv(VecEnv):
@@ -34,7 +34,7 @@ class CraneVecEnv(VecEnv):
     """
 
     def __init__(self, num_envs: int, env_id: str = "ForestryCrane-v0", **options: Any):
-        if not crane_env.is_crane(env_id):
+        if not crane_trials.is_crane(env_id):
             raise ValueError(f"{env_id} is not the crane; SB3's make_vec_env takes other tasks")
         mode = AutoresetMode.SAME_STEP  # as SB3 expects it
         envs = gymnasium.make_vec(env_id, num_envs, autoreset_mode=mode, **options)

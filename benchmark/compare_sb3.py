@@ -35,6 +35,7 @@ import torch
 import tyro
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import Seed
 
@@ -89,8 +90,8 @@ class Args:
 
 def judge(task: str, policy: Any) -> tuple[float, float]:
     """Mean and standard deviation of the return over EPISODES of a policy for `run_trials`."""
-    envs = crane_env.make_envs(task, EPISODES)
-    returns = crane_env.run_trials(policy, envs, EVAL_SEED)["episodic_return"]
+    envs = crane_trials.make_envs(task, EPISODES)
+    returns = crane_trials.run_trials(policy, envs, EVAL_SEED)["episodic_return"]
     envs.close()
     return float(returns.mean()), float(returns.std())
 
@@ -199,7 +200,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def main() -> None:
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     if not args.results.parent.is_dir():
         raise SystemExit(f"--results: no folder {args.results.parent}; make it first")

@@ -18,6 +18,7 @@ import tyro
 from test_hydraulics import AXES, LABS_FIT, MEASURED, TIMES, response
 
 import crane_env
+import crane_trials
 
 FIGURE = Path(__file__).parent.parent / "assets" / "figures" / "drives.svg"
 
@@ -44,5 +45,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     tyro.cli(main, description=__doc__)

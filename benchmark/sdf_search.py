@@ -28,6 +28,7 @@ import tyro
 from tyro.conf import Positional
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import MAX_MISS, MIN_CLEARANCE
 
@@ -59,14 +60,14 @@ def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
     torch.set_num_threads(1)
     policy, task, _ = eval_crane.load_policy(path)
     env_id, options = eval_crane.task_of(eval_crane.Args(contact="sdf"), task)
-    diameters, seeds = crane_env.monte_carlo_trials(SEED, TRIALS)
+    diameters, seeds = crane_trials.monte_carlo_trials(SEED, TRIALS)
     rows, reference = [], None
     for initpoints, iterations in SETTINGS:
         # `load_model` reads these constants
         crane_env.SDF_INITPOINTS, crane_env.SDF_ITERATIONS = initpoints, iterations
         start = time.perf_counter()
-        envs = crane_env.make_envs(env_id, len(seeds), diameter=diameters, **options)
-        results = crane_env.run_trials(policy, envs, seeds)
+        envs = crane_trials.make_envs(env_id, len(seeds), diameter=diameters, **options)
+        results = crane_trials.run_trials(policy, envs, seeds)
         seconds = time.perf_counter() - start
         success, miss = results["success"], results["centre_miss"]
         missed = np.nan  # of the slow reference
@@ -93,5 +94,5 @@ def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
 
 
 if __name__ == "__main__":
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     tyro.cli(main, description=__doc__)

@@ -33,6 +33,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv
 
@@ -213,5 +214,5 @@ def main(part: Positional[Literal["steps", "memory", "kills", "arguments"]]) -> 
 
 
 if __name__ == "__main__":
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     tyro.cli(main, description=__doc__)

@@ -56,6 +56,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tqdm import tqdm
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv
 
@@ -424,7 +425,7 @@ def ratios(results: Results) -> list[tuple[str, float, float, float]]:
 
 
 def main() -> None:
-    crane_env.one_line_errors()
+    crane_trials.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     full = not args.quick and set(args.only) == set(PARTS)
     path = args.csv or (RESULTS if full else None)

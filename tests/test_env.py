@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, NormalizeObservation, NormalizeReward
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import DEFAULTS, CraneEnv, CraneVectorEnv, Options
 
@@ -55,7 +56,7 @@ def test_the_papers_task_is_as_printed():
         "frame_skip": 1,
         "actuators": "ideal",
         "randomize": 0.0,
-        "rates": False,
+        "sensors": False,
         "contact": "sdf",
         "reward": "paper",
         "speed": "real",
@@ -123,18 +124,20 @@ def docstring_table(first_column_values):
 
 
 def test_observation_table_matches_the_space():
-    table = docstring_table(26)
-    space = CraneVectorEnv(1, rates=True).single_observation_space
+    table = docstring_table(32)
+    space = CraneVectorEnv(1, sensors=True).single_observation_space
     np.testing.assert_allclose([float(r[2]) for r in table], space.low, atol=1e-4)
     np.testing.assert_allclose([float(r[3]) for r in table], space.high, atol=1e-4)
-    assert space.shape == (26,) and space.dtype == np.float32
+    assert space.shape == (32,) and space.dtype == np.float32
     short = CraneVectorEnv(1).single_observation_space
     assert short == gymnasium.spaces.Box(space.low[:18], space.high[:18])
     assert [r[0].split()[0] for r in table[:8]] == NAMES
     assert [r[0].split()[0] for r in table[8:14]] == [NAMES[i] for i in crane_env.ACTUATED]
     commands = [r[0].split(",")[0] for r in table[18:24]]
     assert commands == [f"last command of {NAMES[i]}" for i in crane_env.ACTUATED]
-    assert [r[0] for r in table[24:]] == ["q5 velocity", "q6 velocity"]
+    assert [r[0] for r in table[24:26]] == ["q5 velocity", "q6 velocity"]
+    forces = [r[0].split(",")[0] for r in table[26:]]
+    assert forces == [f"force of the oil on {NAMES[i]}" for i in crane_env.ACTUATED]
 
 
 def test_action_table_matches_the_space_and_speeds():
@@ -501,8 +504,8 @@ def test_ends_are_recorded_as_they_come():
 
 
 def test_trials_do_not_depend_on_how_many_there_are():
-    few = crane_env.monte_carlo_trials(5, 2, (0.4,))
-    many = crane_env.monte_carlo_trials(5, 10, (0.3, 0.4))
+    few = crane_trials.monte_carlo_trials(5, 2, (0.4,))
+    many = crane_trials.monte_carlo_trials(5, 10, (0.3, 0.4))
     starts = []
     for diameters, seeds in (few, many):
         envs = CraneVectorEnv(len(seeds), diameter=diameters)

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import crane_env
+import crane_trials
 import eval_crane
 from eval_crane import Args, FixedPolicy, judge
 
@@ -183,7 +184,7 @@ def test_task_to_judge_on(capsys):
     assert options_of(trained_on=trained_on, contact="sdf") == changed
     assert capsys.readouterr().err == ""
     # another task is taken as it is registered, and what the policy does not know is said
-    assert options_of(trained_on=trained_on, env_id=CRANE) == (CRANE, {"rates": False})
+    assert options_of(trained_on=trained_on, env_id=CRANE) == (CRANE, {"sensors": False})
     said = capsys.readouterr().err.splitlines()
     assert sorted(line.split("=")[0] for line in said) == [
         f"the policy knows {name}" for name in ("axes", "frame_skip", "offset", "signed_yaw")
@@ -218,7 +219,7 @@ def test_the_contact_model_reported_is_the_one_judged(run_here, monkeypatch):
     judged = []
 
     def one_failure(policy, env_id, options, args):
-        envs = crane_env.make_envs(env_id, 1, **options)
+        envs = crane_trials.make_envs(env_id, 1, **options)
         judged.append(envs.unwrapped.options["contact"])
         record = {"success": False, "gentle": False, "time_to_reach": 1.0, "centre_miss": 0.0}
         return [{"diameter": 0.5, "failure": "overspeed", **record}]

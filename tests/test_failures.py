@@ -18,6 +18,7 @@ from filelock import FileLock
 from script_runs import ALGORITHMS, command, environment, module, only_run, run, scalars, small
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import Range
 
@@ -218,7 +219,7 @@ def test_a_closed_terminal_changes_no_exit_status(tmp_path, signum, code):
 )
 def test_errors_that_need_one_line(capsys, monkeypatch, error, said):
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    crane_env.one_line_errors(" hint")
+    crane_trials.one_line_errors(" hint")
     sys.excepthook(type(error), error, None)
     hint = " hint" if isinstance(error, OSError) else ""
     assert capsys.readouterr().err == f"\n{said}{hint}\n"
@@ -373,7 +374,7 @@ def test_a_second_resume_of_the_same_run_is_refused(finished, run_here):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_interrupted_evaluation_is_made_on_resume(tmp_path, run_here, monkeypatch, algorithm):
     """A kill in the evaluation of update 15, and one in the final trials."""
-    evaluate, calls = crane_env.evaluate, []
+    evaluate, calls = crane_trials.evaluate, []
 
     def killed_at(call):
         def killed(*args, **kwargs):

@@ -22,7 +22,7 @@ def choices(name):
 
 literals = [
     "actuators",
-    "rates",
+    "sensors",
     "reward",
     "speed",
     "offset",

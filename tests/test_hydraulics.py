@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import crane_env
+import machine
 from crane_env import ACTUATED, JOINTS, CraneVectorEnv
+from machine import Valves
 
 # Geryyy/crane_model, test/step_response_fixture.json: (speed - before) / (settled - before) after
 # a step of the velocity command at 0, mean over the edges of a recording
@@ -31,7 +33,9 @@ FAR_LOG = np.array([[-20.0, 0.0, 0.0]])
 
 
 def hydraulic(n=1, **options):
-    envs = CraneVectorEnv(n, env_threads=1, **{"actuators": "hydraulic", "rates": True, **options})
+    envs = CraneVectorEnv(
+        n, env_threads=1, **{"actuators": "hydraulic", "sensors": True, **options}
+    )
     envs.reset(seed=0)
     return envs
 
@@ -92,12 +96,12 @@ def test_drives_lie_within_the_identified_bands():
     stiffness = np.array([3.191e5, 1.834e6, 5.78e5, 3.5e6 / 2, 7296])
     damping = np.array([7520, 1.656e5, 4.70e4, 1.339e5 / 2, 483.7])
     bands = [(0.63, 1.25), (0.70, 1.50), (0.5, 3), (0.06, 1.5), (0.35, 1.7)]
-    for ratio, (low, high) in zip(crane_env.STIFFNESS[:5] / stiffness, bands):
+    for ratio, (low, high) in zip(machine.STIFFNESS[:5] / stiffness, bands):
         assert low <= ratio <= high
     bands = [(0.84, 2.2), (0.4, 2.3), (0.7, 1.5), (0.12, 2.4), (0.13, 3.3)]
-    for ratio, (low, high) in zip(crane_env.DAMPING[:5] / damping, bands):
+    for ratio, (low, high) in zip(machine.DAMPING[:5] / damping, bands):
         assert low <= ratio <= high
-    assert (crane_env.DEAD_TIME >= 0.04).all() and (crane_env.DEAD_TIME <= 0.15).all()
+    assert (machine.DEAD_TIME >= 0.04).all() and (machine.DEAD_TIME <= 0.15).all()
 
 
 def test_the_same_motion_at_any_frame_skip():
@@ -123,60 +127,61 @@ def test_nothing_moves_within_the_dead_time():
         envs.advance(np.full((1, 6), 0.5))
         servos = np.abs(envs.act[0] - before)[[0, 1, 2, 3, 5, 6]] > 1e-9
         moved = np.where((moved == 0) & servos, k * crane_env.TIMESTEP, moved)
-    late = np.array(crane_env.DEAD_TIME)
-    late[3] += crane_env.BREAKAWAY
+    late = np.array(machine.DEAD_TIME)
+    late[3] += machine.BREAKAWAY
     assert (moved > late).all() and (moved <= late + 0.03).all()
 
 
 def test_a_moving_telescope_needs_no_breakaway():
     """Its valve opens late from rest only, and closes again at rest."""
-    envs = hydraulic()
+    valves, ids, q = Valves(1), np.array([0]), np.zeros((1, 3))
     action = np.array([[0, 0, 0, 0.5, 0, 0]])
-    first = [envs.valves(np.array([0]), action, 0.02)[0, 3] for _ in range(8)]
+    first = [valves.mean_speed(ids, action, q, 0.02)[0, 3] for _ in range(8)]
     assert first[:5] == [0] * 5 and first[5] > 0 and first[7] == pytest.approx(0.5, rel=0.01)
-    assert envs.valves(np.array([0]), -action, 0.02)[0, 3] < 0  # straight through zero
+    assert valves.mean_speed(ids, -action, q, 0.02)[0, 3] < 0  # straight through zero
     for _ in range(10):
-        envs.valves(np.array([0]), 0 * action, 0.02)
-    assert envs.valves(np.array([0]), action, 0.02)[0, 3] == pytest.approx(0, abs=1e-9)
+        valves.mean_speed(ids, 0 * action, q, 0.02)
+    assert valves.mean_speed(ids, action, q, 0.02)[0, 3] == pytest.approx(0, abs=1e-9)
 
 
 def test_the_lag_of_a_valve_is_exact_over_any_step():
     """Ten steps of 2 ms let through what one of 20 ms does."""
     command = np.array([[0.1, -0.05, 0.08, 0.0, 0.3, -0.2]])
-    once, often = hydraulic(), hydraulic()
-    mean = once.valves(np.array([0]), command, 0.02)
-    each = [often.valves(np.array([0]), command, 0.002) for _ in range(10)]
+    once, often, ids, q = Valves(1), Valves(1), np.array([0]), np.zeros((1, 3))
+    mean = once.mean_speed(ids, command, q, 0.02)
+    each = [often.mean_speed(ids, command, q, 0.002) for _ in range(10)]
     np.testing.assert_allclose(np.mean(each, axis=0), mean, atol=1e-12)
     np.testing.assert_allclose(often.opening, once.opening, atol=1e-12)
 
 
 def test_all_joints_share_the_pump():
     """Full speed everywhere asks for several times its flow; little asks get all they want."""
-    envs = hydraulic()
-    ids, low, high = np.array([0]), *envs.speed
+    envs, valves = hydraulic(), Valves(1)
+    ids, (low, high) = np.array([0]), envs.speed
     for _ in range(100):
-        full, fast = envs.valves(ids, high[None], 0.02), envs.opening.copy()
+        full = valves.mean_speed(ids, high[None], envs.qpos, 0.02)
+    fast = valves.opening
     np.testing.assert_allclose(full / fast, (full / fast)[0, 0])  # one share for all
     q2, q3 = envs.qpos[0, 1:3]
     lever = np.ones(6)
-    lever[1:3] = crane_env.cylinder_levers(np.array([q2]), np.array([q3]))[:, 0]
-    flow = np.sum(crane_env.OIL[1] * lever * full[0])
+    lever[1:3] = machine.cylinder_levers(np.array([q2]), np.array([q3]))[:, 0]
+    flow = np.sum(machine.OIL[1] * lever * full[0])
     assert flow == pytest.approx(0.95 * 1.4e-3) and full[0, 0] < 0.5 * high[0]
     for _ in range(100):
-        little = envs.valves(ids, 0.1 * low[None], 0.02)
+        little = valves.mean_speed(ids, 0.1 * low[None], envs.qpos, 0.02)
     np.testing.assert_allclose(little, 0.1 * low[None], rtol=1e-5)
 
 
 def test_levers_of_the_cylinders():
     """Against their lengths, and never zero, so that oil always moves the joint."""
     q2, q3 = np.linspace(-1.1, 1.563, 40), np.linspace(-0.91, 1.5, 40)
-    boom, arm = crane_env.cylinder_levers(q2, q3)
+    boom, arm = machine.cylinder_levers(q2, q3)
     assert (0.05 < boom).all() and (boom < 0.5).all()
     assert (0.1 < arm).all() and (arm < 0.5).all() and 0.3 < arm.mean() < 0.4
     # the arm's cylinder at q3 = 0, by hand: from (-1.6802, -0.0485) to (-0.118, -0.468)
     x, y = -0.118 + 1.6802, -0.468 + 0.0485
     expected = abs(-0.118 * y - -0.468 * x) / np.hypot(x, y)
-    _, (lever,) = crane_env.cylinder_levers(np.zeros(1), np.zeros(1))
+    _, (lever,) = machine.cylinder_levers(np.zeros(1), np.zeros(1))
     assert lever == pytest.approx(expected, abs=1e-4)
 
 
@@ -190,17 +195,20 @@ def test_passive_joints_and_force_limits_are_the_machines():
     assert (model.actuator_gainprm[:8, 0] == 0).all()  # no velocity servo is left
 
 
-def test_the_policy_sees_its_last_command_and_the_swing():
+def test_the_policy_sees_its_last_command_the_swing_and_the_forces():
     envs = hydraulic(4)
     rng = np.random.default_rng(0)
     obs, _ = envs.reset(seed=0)
-    assert obs.shape == (4, 26) and not obs[:, 18:].any()
+    assert obs.shape == (4, 32) and not obs[:, 18:26].any()
+    driven = [0, 1, 2, 3, 7, 8]
+    static = envs.qfrc_bias[:, driven] / envs.model.jnt_actfrcrange[driven, 1]
+    np.testing.assert_allclose(obs[:, 26:], static, atol=1e-5)  # a crane at rest
     for _ in range(5):
         actions = rng.uniform(-1.5, 1.5, (4, 6))
         obs, *_ = envs.advance(actions)
         np.testing.assert_allclose(obs[:, 18:24], np.clip(actions, -1, 1), atol=1e-6)
-        np.testing.assert_allclose(obs[:, 24:], envs.qvel[:, [5, 6]], atol=1e-5)
-    assert np.abs(obs[:, 24:]).max() > 0.01
+        np.testing.assert_allclose(obs[:, 24:26], envs.qvel[:, [5, 6]], atol=1e-5)
+    assert np.abs(obs[:, 24:26]).max() > 0.01 and np.ptp(obs[:, 26:], axis=0).min() > 0.01
 
 
 def test_an_idle_hydraulic_crane_stays():
@@ -305,7 +313,7 @@ def test_randomize_draws_from_the_bands():
     for share in (1.0, 0.25):
         envs = hydraulic(256, randomize=share)
         _, info = envs.reset(seed=1)
-        for name, (nominal, low, high) in crane_env.DRAWN.items():
+        for name, (nominal, low, high) in machine.DRAWN.items():
             drawn = info[f"drawn_{name}"]
             low, high = (nominal + share * (bound - nominal) for bound in (low, high))
             assert (drawn >= low - 1e-9).all() and (drawn <= high + 1e-9).all(), name
@@ -334,9 +342,9 @@ def test_what_is_drawn_reaches_the_engine():
         np.testing.assert_allclose(model.actuator_biasprm[8:, 1], -model.actuator_gainprm[8:, 0])
         damping = model.dof_damping[crane_env.SERVOS]
         np.testing.assert_allclose(damping, info["drawn_damping"][i, servos])
-        late = model.actuator_delay[8:] - crane_env.DEAD_TIME[servos]
+        late = model.actuator_delay[8:] - machine.DEAD_TIME[servos]
         np.testing.assert_allclose(late, info["drawn_late"][i], atol=1e-9)
-        assert (model.actuator_delay[8:] <= crane_env.MAX_DELAY * crane_env.TIMESTEP).all()
+        assert (model.actuator_delay[8:] <= machine.MAX_DELAY * crane_env.TIMESTEP).all()
         assert (model.actuator_delay[8:] >= crane_env.TIMESTEP).all()
         radius = envs.state().diameter[i] / 2
         density = model.body("log").mass[0] / (np.pi * radius**2 * crane_env.LOG_LENGTH)
@@ -372,11 +380,12 @@ def test_what_is_drawn_reaches_the_observation_and_not_the_reward():
 
 def test_the_speed_gain_is_that_of_the_direction():
     envs = hydraulic(2, randomize=1.0)
+    envs.reset(seed=0)
     envs.drawn["gain"][:] = np.array([np.full(6, 0.9), np.full(6, 1.2)])
-    command = 0.1 * envs.speed
-    for _ in range(100):
-        speed = envs.valves(np.arange(2), command, 0.02)
-    np.testing.assert_allclose(speed / command, [[0.9] * 6, [1.2] * 6], rtol=1e-4)
+    for _ in range(10):
+        envs.advance(np.array([[-0.1] * 6, [0.1] * 6]))
+    speed = envs.valves.opening / (0.1 * envs.speed)
+    np.testing.assert_allclose(speed, [[0.9] * 6, [1.2] * 6], rtol=1e-3)
 
 
 def test_randomize_without_hydraulics():

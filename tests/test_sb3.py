@@ -7,6 +7,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 import crane_env
+import crane_trials
 from crane_env import CraneVectorEnv
 from sb3_crane import CraneVecEnv
 
@@ -76,5 +77,5 @@ def test_sb3_trains_saves_and_is_judged(tmp_path, monkeypatch):
     )
     model.save(tmp_path / "model")
     model = PPO.load(tmp_path / "model", device="cpu")
-    scores = crane_env.evaluate(model, "ForestryCrane-v0", trials=1, seed=1, env_threads=1)
+    scores = crane_trials.evaluate(model, "ForestryCrane-v0", trials=1, seed=1, env_threads=1)
     assert scores["success_rate"] == 0 and np.isfinite(scores["episodic_return"])

@@ -26,6 +26,7 @@ from script_runs import (
 )
 
 import crane_env
+import crane_trials
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -498,7 +499,7 @@ def test_a_second_ctrl_c_stops_at_once_and_nohup_is_respected(tmp_path):
 def test_a_stop_during_an_evaluation_keeps_the_update(
     tmp_path, monkeypatch, run_here, capsys, algorithm
 ):
-    evaluate = crane_env.evaluate
+    evaluate = crane_trials.evaluate
 
     def interrupted(*args, **kwargs):
         os.kill(os.getpid(), signal.SIGINT)

@@ -10,6 +10,7 @@ import recall_env  # noqa: F401  registers Endless-v0 and others
 from gymnasium.vector import AutoresetMode
 
 import crane_env
+import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv, make_envs, rollout_report, run_trials
 from scripted_crane import ScriptedCrane
@@ -41,14 +42,14 @@ gymnasium.register("OtherTask-v0", vector_entry_point=OtherTask)
     ],
 )
 def test_is_crane(env_id, expected):
-    assert crane_env.is_crane(env_id) is expected
+    assert crane_trials.is_crane(env_id) is expected
 
 
 def test_is_crane_of_no_task():
     with pytest.raises(gymnasium.error.Error, match="Nowhere"):
-        crane_env.is_crane("Nowhere-v0")
+        crane_trials.is_crane("Nowhere-v0")
     with pytest.raises(ImportError, match="no_module"):
-        crane_env.is_crane("no_module:Nowhere-v0")
+        crane_trials.is_crane("no_module:Nowhere-v0")
 
 
 def test_make_envs_gives_the_crane_its_options():
@@ -168,7 +169,7 @@ class Script:
     def step(self, actions):
         self.actions.append(actions)
         ended, returns, success = map(np.array, self.left.popleft())
-        info = {name: 10.0 * len(self.actions) + np.arange(2) for name in crane_env.RESULTS}
+        info = {name: 10.0 * len(self.actions) + np.arange(2) for name in crane_trials.RESULTS}
         info |= {"success": success, "d_combine": np.ones(2)}
         info["termination"] = np.where(ended, "time_limit", "none")
         if ended.any():
@@ -187,7 +188,7 @@ def test_only_the_first_end_of_a_trial_counts():
     results = run_trials(SimpleNamespace(predict=predict), envs, "seeds", deterministic=False)
     assert envs.seed == "seeds" and not envs.left
     results = {name: values.tolist() for name, values in results.items()}
-    at_ends = {name: [20, 41] for name in crane_env.RESULTS}  # steps 2 and 4
+    at_ends = {name: [20, 41] for name in crane_trials.RESULTS}  # steps 2 and 4
     assert results == at_ends | {
         "episodic_return": [1, 5],
         "success": [True, False],
@@ -214,7 +215,7 @@ class SometimesIdle:
 def test_training_and_judging_agree():
     """On success per diameter and trial, and with an episode loop that shares no code with them."""
     seed, trials, policy = 10_000, 2, SometimesIdle()
-    diameters, seeds = crane_env.monte_carlo_trials(seed, trials)
+    diameters, seeds = crane_trials.monte_carlo_trials(seed, trials)
     envs = CraneVectorEnv(len(seeds), diameter=diameters)
     obs, _ = envs.reset(seed=seeds)
     idle, state, alive = obs[:, 6] > 0, None, np.ones(len(seeds), bool)
@@ -229,7 +230,7 @@ def test_training_and_judging_agree():
     assert 3 <= success.sum() <= 9
 
     training = {"curriculum": True, "retry": 1.0, "difficulty": 0.0}  # an evaluation has none
-    scores = crane_env.evaluate(policy, "ForestryCrane-v0", trials, seed, 1, **training)
+    scores = crane_trials.evaluate(policy, "ForestryCrane-v0", trials, seed, 1, **training)
     assert scores.pop("episodic_return") == pytest.approx(returns.mean())
     assert scores.pop("success_rate") == pytest.approx(success.mean())
     expected = {f"success_rate_{d}m": success[diameters == d].mean() for d in crane_env.DIAMETERS}
@@ -248,7 +249,7 @@ def test_evaluation_of_other_tasks():
             assert obs.shape == (3, 1) and deterministic
             return np.zeros((3, 1), np.float32), None
 
-    scores = crane_env.evaluate(Zero(), "recall_env:Endless-v0", 3, 0, retry=0.25)
+    scores = crane_trials.evaluate(Zero(), "recall_env:Endless-v0", 3, 0, retry=0.25)
     assert scores == {"episodic_return": 5.0}
     with pytest.raises(ValueError, match="no option contact"):
-        crane_env.evaluate(Zero(), "recall_env:Endless-v0", 3, 0, contact="sdf")
+        crane_trials.evaluate(Zero(), "recall_env:Endless-v0", 3, 0, contact="sdf")

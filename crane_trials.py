@@ -1,0 +1,181 @@
+"""What surrounds a policy: cranes to train and to judge it on, trials, files, errors.
+
+The training scripts and eval_crane.py use it. The protocol of the trials is docs/results.md's:
+log diameters 0.3 ... 0.8 m, seeds that belong to the trial alone, success as `CraneVectorEnv` says.
+"""
+
+import importlib
+import os
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+import gymnasium
+import numpy as np
+from filelock import FileLock, Timeout
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from numpy import ndarray as Array
+from numpy.random import SeedSequence
+
+from crane_env import CARE, CONDITIONS, DIAMETERS, TERMINATIONS, TERMS, CraneVectorEnv
+
+RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
+RESULTS |= {*CONDITIONS, *CARE}
+LOCKS: list[FileLock] = []  # of the folders in which this process trains
+
+
+def one_line_errors(hint: str = "") -> None:
+    """From now on, files that cannot be used and Ctrl-C end with one line and no traceback.
+
+    hint follows a file's error. All other errors keep their traceback.
+    """
+
+    def report(kind: type, error: BaseException, trace: TracebackType | None) -> None:
+        if issubclass(kind, KeyboardInterrupt):
+            say("\ninterrupted", sys.stderr)
+        elif issubclass(kind, OSError):
+            say(f"\n{kind.__name__}: {error}{hint}", sys.stderr)
+        else:
+            sys.__excepthook__(kind, error, trace)
+        if issubclass(kind, BrokenPipeError):
+            say("", sys.stdout)
+
+    def report_of_thread(args: threading.ExceptHookArgs) -> None:
+        # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
+        if not issubclass(args.exc_type, OSError):
+            threading.__excepthook__(args)
+
+    sys.excepthook, threading.excepthook = report, report_of_thread
+
+
+def say(line: str, stream: TextIO | None = None) -> None:
+    """Print a line, unless the terminal or the pipe is closed. Then nothing more goes there."""
+    stream = stream or sys.stdout
+    try:
+        print(line, file=stream, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def lock_folder(folder: Path) -> None:
+    """Make a run's folder and hold its lock until the process ends. SystemExit if another does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / "lock", blocking=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise SystemExit(f"another process trains in {folder}") from None
+    LOCKS.append(lock)
+
+
+def is_crane(env_id: str) -> bool:
+    """Whether the task is this crane or a subclass of it: `CraneVectorEnv` steps it."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    creator = gymnasium.spec(name).vector_entry_point
+    creator = load_env_creator(creator) if isinstance(creator, str) else creator
+    return isinstance(creator, type) and issubclass(creator, CraneVectorEnv)
+
+
+def make_envs(
+    env_id: str, num_envs: int, env_threads: int = 0, **options: Any
+) -> gymnasium.vector.VectorEnv:
+    """N environments of any Gymnasium task, with SAME_STEP autoreset and `info["episode"]`.
+
+    env_threads and options are the crane's. Other tasks refuse options. They ignore only retry,
+    which some scripts set by default.
+    """
+    if is_crane(env_id):
+        envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)
+    elif unknown := options.keys() - {"retry"}:
+        raise ValueError(f"{env_id} is not the crane and has no option {', '.join(unknown)}")
+    else:
+        autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        envs = gymnasium.make_vec(env_id, num_envs, "sync", vector_kwargs=autoreset)
+    for space in (envs.single_observation_space, envs.single_action_space):
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise ValueError("its observations or actions are no flat Box")
+    return RecordEpisodeStatistics(envs)
+
+
+def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[str, float]:
+    """What TensorBoard shows of a rollout of `make_envs`, from the `info` of each of its steps."""
+    report, crane = {}, envs.unwrapped
+    ends = [(info, i) for info in infos if "episode" in info for i in info["_episode"].nonzero()[0]]
+    if ends:
+        report["charts/episodic_return"] = np.mean([info["episode"]["r"][i] for info, i in ends])
+        report["charts/episodic_length"] = np.mean([info["episode"]["l"][i] for info, i in ends])
+    if isinstance(crane, CraneVectorEnv):
+        if crane.recent_success:
+            report["charts/success_rate"] = np.mean(crane.recent_success)
+        report["charts/difficulty"] = crane.difficulty
+        report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
+        endings = [info["termination"][i] for info, i in ends]
+        for name in TERMINATIONS:
+            report[f"termination/{name}"] = endings.count(name) / max(1, len(endings))
+    return report
+
+
+def monte_carlo_trials(
+    seed: int, trials: int, diameters: Sequence[float] = DIAMETERS
+) -> tuple[Array, list[SeedSequence]]:
+    """Diameters (m) and seeds of trials per diameter, for `CraneVectorEnv` and its `reset`.
+
+    Trial k at a diameter is the same whatever the number of trials and the other diameters.
+    """
+    keys = [(round(1000 * d), k) for d in diameters for k in range(trials)]
+    return np.repeat(diameters, trials), [SeedSequence(seed, spawn_key=key) for key in keys]
+
+
+def run_trials(
+    policy: Any, envs: gymnasium.vector.VectorEnv, seeds: Any, deterministic: bool = True
+) -> dict[str, Array]:
+    """One whole episode in each environment of `make_envs`: RESULTS, (N,) each.
+
+    policy.predict(obs (N, obs_dim), state, deterministic=...) returns actions (N, act_dim) and the
+    next state. The first state is None. Stable-Baselines3's models have this method too.
+    """
+    names = RESULTS if isinstance(envs.unwrapped, CraneVectorEnv) else {"episodic_return"}
+    obs, _ = envs.reset(seed=seeds)
+    results, state, ended = {}, None, np.zeros(envs.num_envs, bool)
+    while not ended.all():
+        actions, state = policy.predict(obs, state, deterministic=deterministic)
+        obs, _, terminated, truncated, info = envs.step(actions)
+        first = (terminated | truncated) & ~ended  # later ends belong to other episodes
+        if first.any():
+            info["episodic_return"] = info["episode"]["r"]
+            for name in names:
+                results.setdefault(name, np.zeros_like(info[name]))[first] = info[name][first]
+        ended |= first
+    return results
+
+
+def evaluate(
+    policy: Any, env_id: str, trials: int, seed: int, env_threads: int = 0, **options: Any
+) -> dict[str, float]:
+    """Mean return and success rates in trials per diameter (other tasks: trials in all).
+
+    These are trials of the full task. They set diameter, difficulty, curriculum and retry.
+    """
+    crane = is_crane(env_id)
+    if crane:
+        diameters, seeds = monte_carlo_trials(seed, trials)
+        options |= {"diameter": diameters, "retry": 0.0, "curriculum": False, "difficulty": 1.0}
+        envs = make_envs(env_id, len(seeds), env_threads, **options)
+    else:
+        envs, seeds = make_envs(env_id, trials, **options), seed
+    results = run_trials(policy, envs, seeds)
+    envs.close()
+    scores = {"episodic_return": results["episodic_return"].mean().item()}
+    if crane:
+        scores["success_rate"] = results["success"].mean().item()
+        scores["gentle_rate"] = results["gentle"].mean().item()
+        for d in DIAMETERS:
+            scores[f"success_rate_{d}m"] = results["success"][diameters == d].mean().item()
+    return scores

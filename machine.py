@@ -1,0 +1,133 @@
+"""The real machine's drives: how oil moves the joints of the crane, as measured on it.
+
+A command passes a dead time, the lag of a valve, and a spring whose rest position moves at the
+commanded speed, the force of which is limited. Joints are damped. The pump gives only so much oil.
+`crane_env` simulates this with actuators="hydraulic". Sources of all numbers: assets/README.md,
+"Drives".
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy import ndarray as Array
+
+# Six numbers belong to q1, q2, q3, each telescope stage, q7 and q8.
+STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 5.0e4])  # N m/rad, N/m
+DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 1300.0])  # N m s/rad, N s/m
+LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.06])  # s, of the valve, first order
+DEAD_TIME = np.array([0.117, 0.081, 0.044, 0.060, 0.058, 0.060])  # s
+BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
+MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
+VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
+PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
+MAX_PRESSURE = 25e6  # Pa, of the pump
+# Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
+# The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
+OIL = np.array(
+    [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
+     [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
+)  # fmt: skip
+# What randomize=1 draws uniformly at each start: nominal, lowest and highest value.
+DRAWN = {
+    "stiffness": (
+        STIFFNESS,
+        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 2.5e4]),
+        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 7.5e4]),
+    ),
+    "damping": (
+        DAMPING,
+        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 650.0]),
+        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 2600.0]),
+    ),
+    "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
+    "gain": (  # factor on the speed, of movements down and up
+        np.ones((2, 6)),
+        np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
+        np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
+    ),
+    "density": (650.0, 450.0, 950.0),  # kg/m^3
+    "friction": (1.0, 0.5, 1.5),  # factor on that of all surfaces
+    "pose_error": (np.zeros(3), np.full(3, -0.057), np.full(3, 0.057)),  # m, 0.1 m at most
+    "yaw_error": (0.0, -0.1745, 0.1745),  # rad
+    "joint_error": (np.zeros(8), -0.0087 * (np.arange(8) != 3), 0.0087 * (np.arange(8) != 3)),
+    "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
+}
+
+
+def install_drives(spec: mujoco.MjSpec, joints: Sequence[int], commands: Sequence[int]) -> None:
+    """Turn the servos of assets/crane.xml into drives.
+
+    joints are the indices of the driven joints, commands says which of the six commands each obeys.
+    """
+    for index, command in zip(joints, commands):
+        joint = spec.joints[index]
+        joint.damping[0] = DAMPING[command]
+        spec.actuator(joint.name).gainprm[0] = spec.actuator(joint.name).biasprm[2] = 0
+        spring = spec.actuator(f"{joint.name}_integral")
+        spring.gainprm[0], spring.biasprm[1] = STIFFNESS[command], -STIFFNESS[command]
+        spring.delay, spring.nsample = DEAD_TIME[command], MAX_DELAY
+
+
+def cylinder_levers(q2: Array, q3: Array) -> Array:
+    """Metres that boom and arm cylinder lengthen per radian of q2 and q3, (2, N).
+
+    The arm's cylinder pushes the arm itself. The boom's pushes the joint of two bars, 0.57 m to
+    the column and 0.124 m to the boom.
+    """
+
+    def boom(q: Array) -> Array:
+        x, y = 0.4539 * np.cos(q) + 0.036 * np.sin(q) + 0.12, 0.4539 * np.sin(q) - 0.036 * np.cos(q)
+        y = y + 0.07  # from the bars' pivot on the column to that on the boom
+        apart = np.hypot(x, y)
+        along = (0.57**2 - 0.124**2 + apart**2) / (2 * apart)
+        across = np.sqrt(np.maximum(0.57**2 - along**2, 0))
+        foot_x, foot_y = 0.553, -1.6982  # of the cylinder, from the same pivot
+        knee_x, knee_y = (along * x + across * y) / apart, (along * y - across * x) / apart
+        return np.hypot(knee_x - foot_x, knee_y - foot_y)
+
+    def arm(q: Array) -> Array:
+        x, y = -0.118 * np.cos(q) + 0.468 * np.sin(q), -0.118 * np.sin(q) - 0.468 * np.cos(q)
+        return np.hypot(x + 1.6802, y + 0.0485)
+
+    step = 1e-4
+    levers = [(f(q + step) - f(q - step)) / (2 * step) for f, q in ((boom, q2), (arm, q3))]
+    return np.array(levers)
+
+
+def oil_per_movement(q: Array, dq: Array) -> Array:
+    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6)."""
+    oil = np.where(dq < 0, OIL[0], OIL[1])
+    oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+    return oil
+
+
+class Valves:
+    """Valves and pump of N cranes: from commanded speeds to the speeds that the oil gives."""
+
+    def __init__(self, num_envs: int):
+        self.opening = np.zeros((num_envs, 6))  # rad/s, m/s, what the valves let through
+        self.telescope_wait = np.zeros(num_envs)  # s since a resting telescope was commanded
+
+    def close(self, ids: Array) -> None:
+        """Valves of cranes `ids` as in a crane at rest."""
+        self.opening[ids] = self.telescope_wait[ids] = 0
+
+    def mean_speed(self, ids: Array, command: Array, q: Array, seconds: float) -> Array:
+        """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
+
+        command (n, 6) in rad/s and m/s, q (n, ...) the joints, rad and m. A valve follows its
+        command as a first-order lag. A resting telescope's load-holding valve opens late. If all
+        joints ask for more oil than the pump gives, all get the same share.
+        """
+        opening, telescope = self.opening[ids], command[:, 3]
+        resting = (np.abs(opening[:, 3]) < 1e-3) & (telescope != 0)
+        self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
+        closed = resting & (self.telescope_wait[ids] <= BREAKAWAY)
+        target = command.copy()
+        target[closed, 3] = 0.0
+        decay = np.exp(-seconds / LAG)
+        mean = target + (opening - target) * LAG / seconds * (1 - decay)
+        self.opening[ids] = target + (opening - target) * decay
+        demand = np.sum(oil_per_movement(q, mean) * np.abs(mean), axis=-1, keepdims=True)
+        return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
