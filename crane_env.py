@@ -8,7 +8,8 @@ The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (
 stages), and its grapple hangs from two passive joints q5, q6 below a rotator q7 and two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
 Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there,
-`ForestryCraneHydraulic-v0` the same crane with the drives that were measured on the machine.
+`ForestryCraneHydraulic-v0` the same crane with the drives that were measured on the machine, and in
+`ForestryCraneRandomized-v0` each episode draws a machine, a log and sensors with errors.
 Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
 
 Observation, float32, `Box` of shape (18,), with sensors (32,):
@@ -137,7 +138,8 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 5.0  # what r_ground takes away at GENTLE_FORCE, from nothing at half of it
+GROUND_WEIGHT = 10.0  # what r_ground takes away at the second of these forces, in the full task
+GROUND_FORCES = (15e3, 25e3)  # N, of the crane on the ground, where r_ground begins and ends
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
@@ -238,7 +240,6 @@ class Options(TypedDict, total=False):
     axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
     pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
     difficulty: Share  # 0: easy starts, 1: the full task (1.0)
-    curriculum: bool  # start at difficulty 0 and raise it with the success rate (False)
     retry: Share  # share of episodes that start as a recent failure of that crane did (0.0)
     integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
     solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
@@ -247,14 +248,14 @@ class Options(TypedDict, total=False):
 DEFAULTS = Options(
     frame_skip=20, actuators="ideal", randomize=0.0, sensors=False, contact="primitive",
     reward="staged", speed="real", offset="plus", signed_yaw=True, axes="crane",
-    pose_noise="none", difficulty=1.0, curriculum=False, retry=0.0, integrator="implicitfast",
-    solver="Newton",
+    pose_noise="none", difficulty=1.0, retry=0.0, integrator="implicitfast", solver="Newton",
 )  # fmt: skip
 PAPER = Options(  # ForestryCranePaper-v0
     frame_skip=1, contact="sdf", reward="paper", offset="minus", signed_yaw=False, axes="world",
     integrator="implicit", solver="CG",
 )  # fmt: skip
 HYDRAULIC = Options(actuators="hydraulic", sensors=True)  # ForestryCraneHydraulic-v0
+RANDOMIZED = Options(randomize=1.0, **HYDRAULIC)  # ForestryCraneRandomized-v0
 
 
 def complete(options: Options) -> Options:
@@ -347,7 +348,9 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
-    carried: Array | float = 0.0  # (N,) share of the log's weight that the ground does not carry
+    carried: Array | float = (
+        0.0  # (N,) share of the log's weight that neither log nor crane puts on the ground
+    )
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
@@ -399,7 +402,8 @@ def reward_terms(
     clearance: Array,
     miss: Array,
     command: Array,
-    ground: Array | float = 0.0,
+    ground: Array,
+    difficulty: float = 1.0,
     kind: str = "staged",
 ) -> Array:
     """The TERMS of the reward, which is their sum, (5, N).
@@ -410,9 +414,10 @@ def reward_terms(
 
     kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
     the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
-    r_ground punishes hitting the ground, up to three times GENTLE_FORCE.
+    r_ground punishes hitting the ground. An easy task forgives it: a crane that does not lift yet
+    would learn to stay away.
     """
-    r_ground = 0 * d_combine
+    r_ground = np.zeros_like(d_combine)
     r_distance = np.exp(-OMEGA2 * d_combine)
     closed = state.q[:, 7] / Q8_MAX
     if kind == "paper":
@@ -430,7 +435,8 @@ def reward_terms(
         centred = np.exp(-((miss / LIFT_MISS) ** 2))
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
-        r_ground = -GROUND_WEIGHT * np.clip(2 * ground / GENTLE_FORCE - 1, 0, 1) + r_ground
+        low, high = GROUND_FORCES
+        r_ground = -GROUND_WEIGHT * difficulty**2 * np.clip((ground - low) / (high - low), 0, 1)
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 
@@ -523,15 +529,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"diameter must be {needed}, got {diameter}")
             diameter = np.broadcast_to(d.astype(float), num_envs)
         self.options = options = complete(options)
-        if options["curriculum"] and options["difficulty"] != 1:
-            raise ValueError("curriculum sets the difficulty: leave one of the two out")
         self.task = {"revision": REVISION, **options}  # what a trained policy knows of it
         self.num_envs, self.fixed_diameter = int(num_envs), diameter
         self.process = os.getpid()
         self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
         self.viewer = None  # the window, or the renderer of "rgb_array"
         self.speed, self.frame_skip = SPEEDS[options["speed"]], int(options["frame_skip"])
-        self.difficulty = 0.0 if options["curriculum"] else options["difficulty"]
+        self.difficulty = options["difficulty"]
         self.dt = self.frame_skip * TIMESTEP  # s, one decision
         self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
         self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1  # with both its ends
@@ -678,20 +682,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= {"termination": ending, "time_to_reach": self.reach_time.copy()}
         reward = sum(info[term] for term in TERMS)
         for i in np.flatnonzero(ending != "none"):
-            self.record_end(i, bool(info["success"][i]))
+            self.recent_success.append(bool(info["success"][i]))
+            if not info["success"][i]:
+                self.failures[i].append(self.starts[i])  # for retry
         if self.render_mode == "human":
             self.render()
         return obs, np.where(diverged, 0.0, reward), terminated, truncated, info
-
-    def record_end(self, i: int, success: bool) -> None:
-        """Keep a failed start for retry; with curriculum, raise the difficulty with success."""
-        self.recent_success.append(success)
-        if not success:
-            self.failures[i].append(self.starts[i])
-        full = len(self.recent_success) == self.recent_success.maxlen
-        if self.options["curriculum"] and full and np.mean(self.recent_success) > 0.5:
-            self.difficulty = min(1.0, self.difficulty + 0.05)
-            self.recent_success.clear()
 
     def simulate(self, command: Array) -> Array:
         """frame_skip physics steps under a command (N, 6), rad/s and m/s; which diverged, (N,)."""
@@ -828,9 +824,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
         # as in crane.xml; the crane's force on the ground comes last
         parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17], axis=1)
-        *poses, touch, support, _ = parts
+        *poses, touch, support, pressure = parts
         weight = 9.81 * self.batch.body("log").mass[:, 0]
-        carried = np.clip(1 - np.linalg.norm(support, axis=-1) / weight, 0, 1)
+        ground = np.linalg.norm(support, axis=-1) + np.linalg.norm(pressure, axis=-1)
+        carried = np.clip(1 - ground / weight, 0, 1)
         return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0], carried)
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
@@ -840,14 +837,17 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         clearance, miss = log_clearance(state), centre_miss(state)
         kind = self.options["reward"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
-        terms = reward_terms(state, d_combine, clearance, miss, command, self.hit, kind)
+        terms = reward_terms(
+            state, d_combine, clearance, miss, command, self.hit, self.difficulty, kind
+        )
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
         if self.options["randomize"]:
             info |= {f"drawn_{name}": values.copy() for name, values in self.drawn.items()}
         delta_p, q = delta_p + self.drawn["pose_error"], state.q + self.drawn["joint_error"]
         angle = signed_angle + self.drawn["yaw_error"]
         if not self.options["signed_yaw"]:
-            angle = delta_psi
+            change = np.abs(np.cos(signed_angle)) - np.abs(np.cos(angle))
+            angle = np.clip(delta_psi + change, 0, 1)
         if self.options["pose_noise"] != "none":
             now = np.minimum(self.decisions, self.noise.shape[1] - 1)
             delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
@@ -993,3 +993,4 @@ CLASSES = {"entry_point": "crane_env:CraneEnv", "vector_entry_point": "crane_env
 gymnasium.register("ForestryCrane-v0", **CLASSES)
 gymnasium.register("ForestryCranePaper-v0", kwargs=PAPER, **CLASSES)
 gymnasium.register("ForestryCraneHydraulic-v0", kwargs=HYDRAULIC, **CLASSES)
+gymnasium.register("ForestryCraneRandomized-v0", kwargs=RANDOMIZED, **CLASSES)

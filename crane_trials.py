@@ -161,12 +161,12 @@ def evaluate(
 ) -> dict[str, float]:
     """Mean return and success rates in trials per diameter (other tasks: trials in all).
 
-    These are trials of the full task. They set diameter, difficulty, curriculum and retry.
+    These are trials of the full task. They set diameter, difficulty and retry.
     """
     crane = is_crane(env_id)
     if crane:
         diameters, seeds = monte_carlo_trials(seed, trials)
-        options |= {"diameter": diameters, "retry": 0.0, "curriculum": False, "difficulty": 1.0}
+        options |= {"diameter": diameters, "retry": 0.0, "difficulty": 1.0}
         envs = make_envs(env_id, len(seeds), env_threads, **options)
     else:
         envs, seeds = make_envs(env_id, trials, **options), seed

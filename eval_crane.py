@@ -151,7 +151,7 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
         raise SystemExit(f"--env-id {env_id}: {error}") from None
     if not on_crane:
         raise SystemExit(f"--env-id {env_id} is not the crane")
-    names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "curriculum", "retry"}
+    names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
     if args.policy == "file":
         options["sensors"] = trained_on["sensors"]  # what its networks read

@@ -66,6 +66,7 @@ class Args:
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_env.Options = field(default_factory=lambda: {"retry": 0.0})
     """options of the crane; in parentheses: what ForestryCrane-v0 has"""
+    warm_up: Share = 0.5  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
     num_steps: Size = 64  # decisions per crane and rollout
@@ -222,7 +223,7 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
         revision = task.get("revision", crane_env.REVISION)  # only the crane has one
         if (algorithm, revision) != (ALGORITHM, crane_env.REVISION):
             raise SystemExit(f"--resume: {path} is of {algorithm}, task revision {revision}")
-        if not {"weights", "optimizer", "iteration", "difficulty"} <= checkpoint.keys():
+        if not {"weights", "optimizer", "iteration"} <= checkpoint.keys():
             raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since
         options = {name: task[name] for name in crane_env.DEFAULTS if name in task}
@@ -266,6 +267,7 @@ if __name__ == "__main__":
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
+    full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
     physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
     tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
 
@@ -280,8 +282,6 @@ if __name__ == "__main__":
         agent.load_state_dict(checkpoint["weights"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         torch.manual_seed(env_seed)  # new episodes and new samples
-        if is_crane:
-            envs.unwrapped.difficulty = checkpoint["difficulty"]
 
     # Files
     run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
@@ -303,7 +303,6 @@ if __name__ == "__main__":
         policy = {"algorithm": ALGORITHM, "task": task, "args": asdict(args) | {"resume": None}}
         policy |= {"weights": acting, "global_step": iteration * batch_size}
         state = {"weights": weights, "optimizer": optimizer.state_dict(), "iteration": iteration}
-        state["difficulty"] = envs.unwrapped.difficulty if is_crane else 1.0
         state["final_scores"] = final_scores
         # A kill or a full disk leaves the old files whole.
         for name, contents in (("policy", policy), ("checkpoint", policy | state)):
@@ -325,7 +324,7 @@ if __name__ == "__main__":
         """Write the report. Evaluate and save when it is time to, and stop if a signal came."""
         wrong = [name for name, value in report.items() if not np.isfinite(value)]
         if wrong or not all(tensor.isfinite().all() for tensor in agent.state_dict().values()):
-            progress.close()
+            bar.close()
             what = ", ".join(wrong[:2]) or "the weights"
             mend = "lower --learning-rate or look at the task's rewards"
             raise SystemExit(f"update {iteration}: {what} not finite; {mend}")
@@ -338,10 +337,10 @@ if __name__ == "__main__":
         if iteration % 10 == 0 or last or stopping:
             save(iteration)
         if stopping:
-            progress.close()
+            bar.close()
             crane_trials.say(f"stopped after update {iteration}; go on with --resume {run_dir}")
             raise SystemExit(128 + stop_signals[0])
-        progress.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
+        bar.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
     def stop_after_update(signum: int, frame: object) -> None:
         """Ctrl-C, kill or a closed terminal: finish the update. A second Ctrl-C: stop at once."""
@@ -364,14 +363,18 @@ if __name__ == "__main__":
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
     if not remaining:
         print(f"all {num_iterations} updates are done; more --total-timesteps extend the run")
-    progress = tqdm(remaining, initial=first_iteration - 1, total=num_iterations)
-    for iteration in progress:
+    bar = tqdm(remaining, initial=first_iteration - 1, total=num_iterations)
+    for iteration in bar:
         # Schedules
         left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
+        if is_crane:
+            progress = iteration / num_iterations
+            share = progress / args.warm_up if progress < args.warm_up else 1.0
+            envs.unwrapped.difficulty = full_difficulty * share
 
         # Rollout
         rollout_start = time.time()

@@ -42,7 +42,7 @@ ABLATIONS = {
     "offset_minus": ("mppo_beta_crane", "--env.offset minus"),
     "unsigned_yaw": ("mppo_beta_crane", "--env.no-signed-yaw"),
     "axes_world": ("mppo_beta_crane", "--env.axes world"),
-    "curriculum": ("mppo_beta_crane", "--env.curriculum"),
+    "warm_up_none": ("mppo_beta_crane", "--warm-up 0"),
     "retry_none": ("mppo_beta_crane", "--env.retry 0"),
     "frame_skip_10": (
         "mppo_beta_crane",

@@ -46,7 +46,7 @@ flags=(
     --env-id ForestryCranePaper-v0 --env.retry 0
     --total-timesteps 500_000_000 --num-envs 42 --num-steps 1000
     --hidden-sizes 256 256 256 256 --learning-rate 3e-4 --update-epochs 30
-    --gamma 0.8179 --gae-lambda 0.3585 --horizon-growth 1 --reward-scale 0.2 --narrowing 0
+    --gamma 0.8179 --gae-lambda 0.3585 --horizon-growth 1 --reward-scale 0.2 --narrowing 0 --warm-up 0
 )
 minibatches=(--minibatch-size 2000)
 case $algorithm in

@@ -33,7 +33,7 @@ PANELS = {
     "observed angle to the log": ("default", "unsigned_yaw"),
     "axes of the observed position": ("default", "axes_world"),
     "starts that failed before": ("default", "retry_none"),
-    "curriculum": ("default", "curriculum"),
+    "start of the training": ("default", "warm_up_none"),
     "end by the time limit": ("default", "no_bootstrap"),
     "physics steps per decision": ("default", "frame_skip_10", "frame_skip_4"),
 }
@@ -51,7 +51,7 @@ LABELS = {  # names of the runs in the figures
     "unsigned_yaw": "without its sign",
     "axes_world": "of the world",
     "retry_none": "not repeated",
-    "curriculum": "easy starts first",
+    "warm_up_none": "no easy task first",
     "no_bootstrap": "no bootstrapping",
     "frame_skip_10": "10 steps",
     "frame_skip_4": "4 steps",

@@ -65,7 +65,6 @@ def test_the_papers_task_is_as_printed():
         "axes": "world",
         "pose_noise": "none",
         "difficulty": 1.0,
-        "curriculum": False,
         "retry": 0.0,
         "integrator": "implicit",
         "solver": "CG",
@@ -453,42 +452,6 @@ def test_difficulty():
     )
 
 
-def test_curriculum_rises_with_success():
-    """By 0.05 for more than half of 200 episodes, which then count no more."""
-    envs = CraneVectorEnv(2, curriculum=True)
-    envs.reset(seed=0)
-    _, delta_psi, _ = crane_env.relative_pose(envs.state())
-    assert envs.difficulty == 0 and delta_psi.max() < 1e-2
-    for k in range(200):  # half of them
-        envs.record_end(0, k < 100)
-    assert envs.difficulty == 0
-    envs.record_end(1, False)
-    for _ in range(100):  # 99 that push out a success, one that pushes out a failure
-        envs.record_end(1, True)
-    assert envs.difficulty == 0 and sum(envs.recent_success) == 100
-    envs.record_end(1, True)
-    assert envs.difficulty == 0.05 and not envs.recent_success
-    for _ in range(199):
-        envs.record_end(0, True)
-    assert envs.difficulty == 0.05
-    for _ in range(1 + 20 * 200):
-        envs.record_end(0, True)
-    assert envs.difficulty == 1.0
-    envs.reset(seed=0)
-    state, (_, pose, _) = envs.state(), envs.starts[0]
-    full = CraneVectorEnv(2)
-    full.reset(seed=0)
-    assert envs.difficulty == full.difficulty == 1.0
-    np.testing.assert_array_equal(state.log_centre, full.state().log_centre)
-    np.testing.assert_allclose(state.log_centre[0, :2], pose[:2])
-    for _ in range(201):
-        full.record_end(0, True)
-    fixed = CraneVectorEnv(2, difficulty=0.3)
-    for _ in range(201):
-        fixed.record_end(0, True)
-    assert full.difficulty == 1.0 and fixed.difficulty == 0.3  # no curriculum, no change
-
-
 def test_ends_are_recorded_as_they_come():
     """Every end counts once, with its success, and only an end."""
     envs = CraneVectorEnv(16)
@@ -552,7 +515,6 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"axes": "boom"}, "axes must be one of 'crane', 'world'"),
         ({"frame_skp": 5}, "no option 'frame_skp', only .*frame_skip"),
         ({"diametr": 0.5}, "no option 'diametr', only .*diameter"),
-        ({"curriculum": True, "difficulty": 0.5}, "curriculum sets the difficulty"),
         ({"omega2": 1.0}, "no option 'omega2'"),
         ({"diameter": [0.5, 0.5, 0.5]}, "diameter must be one number or 2 numbers"),
         ({"num_envs": 2.5}, r"num_envs must be a whole number in \[1, 16,384\], got 2.5"),

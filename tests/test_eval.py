@@ -130,7 +130,7 @@ def test_shipped_policies_are_of_this_revision(algorithm, capsys):
     assert name == algorithm and task["env_id"] == CRANE
     assert task["revision"] == crane_env.REVISION and capsys.readouterr().err == ""
     # what a policy is trained on is what is registered, but for its training's own options
-    own = {"difficulty", "curriculum", "retry"}
+    own = {"difficulty", "retry"}
     trained = {name: task[name] for name in crane_env.DEFAULTS.keys() - own}
     assert trained.items() <= crane_env.DEFAULTS.items()
 
@@ -176,8 +176,8 @@ def options_of(*, policy="file", trained_on=None, **args):
 def test_task_to_judge_on(capsys):
     other = {"offset": "minus", "axes": "world", "signed_yaw": False, "frame_skip": 10}
     trained_on = {"env_id": MINE, "revision": 6, **crane_env.complete(other)}
-    trained_on |= {"curriculum": True, "difficulty": 0.0, "retry": 0.25}
-    own = ("curriculum", "difficulty", "retry")  # of the training alone
+    trained_on |= {"difficulty": 0.0, "retry": 0.25}
+    own = ("difficulty", "retry")  # of the training alone
     options = {name: trained_on[name] for name in crane_env.DEFAULTS if name not in own}
     assert options_of(trained_on=trained_on) == (MINE, options)
     changed = (MINE, options | {"contact": "sdf"})

@@ -260,7 +260,7 @@ class Harmful:
 def test_no_code_of_a_checkpoint_runs(tmp_path, run_here, algorithm):
     task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_env.DEFAULTS}
     saved = {"algorithm": algorithm, "task": task, "args": vars(module(algorithm).Args())}
-    saved |= {"weights": Harmful(), "optimizer": {}, "iteration": 1, "difficulty": 1.0}
+    saved |= {"weights": Harmful(), "optimizer": {}, "iteration": 1}
     torch.save(saved, tmp_path / "checkpoint.pt")
     torch.save(saved, tmp_path / "policy.pt")
     with pytest.raises(SystemExit, match="checkpoint.pt is damaged or not of this script"):
@@ -383,7 +383,7 @@ def test_an_interrupted_evaluation_is_made_on_resume(tmp_path, run_here, monkeyp
                 raise MemoryError
             return evaluate(*args, **kwargs)
 
-        monkeypatch.setattr(crane_env, "evaluate", killed)
+        monkeypatch.setattr(crane_trials, "evaluate", killed)
 
     arguments = [*small(algorithm), *ECHO, "--eval-every", "5", "--total-timesteps", "1280"]
     killed_at(3)

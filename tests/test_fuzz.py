@@ -29,7 +29,6 @@ literals = [
     "signed_yaw",
     "axes",
     "pose_noise",
-    "curriculum",
 ]
 engine = ["integrator", "solver"]
 shares = {name: st.floats(0, 1) for name in ("difficulty", "retry", "randomize")}
@@ -47,8 +46,6 @@ options = st.fixed_dictionaries(
 
 def run(cranes, decisions, seed, chosen):
     """Bang-bang and uniform actions by turns, each held for a while, beyond the box at times."""
-    if chosen.get("curriculum"):
-        chosen = chosen | {"difficulty": 1.0}  # it sets the difficulty itself
     envs, rng = CraneVectorEnv(cranes, env_threads=2, **chosen), np.random.default_rng(seed)
     obs, _ = envs.reset(seed=seed)
     actions, ends = np.zeros((cranes, 6)), 0

@@ -260,6 +260,18 @@ def test_force_on_the_ground_is_that_of_the_contacts():
     assert info["ground_time"][0] == pytest.approx(above, abs=0.02)
 
 
+def test_a_log_on_jaws_that_stand_on_the_ground_is_not_carried():
+    """Nor is one on the ground; one in the air is, by all its weight."""
+    envs = CraneVectorEnv(3)
+    envs.reset(seed=0)
+    q = [[-1.2, q2, 0.3, 0.5, np.pi / 2 - q2 - 0.3, np.pi / 2, 0, 0.3] for q2 in (0.8, 0.8, 0.3)]
+    envs.place(np.arange(3), np.array(q), np.repeat(FAR_LOG, 3, axis=0), np.full(3, 0.8))
+    envs.qpos[[0, 2], -5] = 2.0  # m, height of two logs, which fall for 0.1 s
+    envs.advance(np.zeros((3, 6)))
+    assert envs.hit[0] == envs.hit[1] == 0 and envs.hit[2] > 10e3
+    np.testing.assert_allclose(envs.state().carried, [1, 0, 0], atol=0.05)
+
+
 def test_oil_of_a_steady_slew():
     """Rack and pinion: 6.362e-4 m^3 for each radian."""
     envs = CraneVectorEnv(1)

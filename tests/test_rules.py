@@ -100,12 +100,13 @@ def test_clearance_and_miss():
 COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaws, 1.3 with them
 
 
-def terms_of(crane, d_combine, *args, **kwargs):
-    """The four terms of the reward of one crane."""
-    measured = crane_env.log_clearance(crane), crane_env.centre_miss(crane)
-    terms = crane_env.reward_terms(crane, np.array([d_combine]), *measured, *args, **kwargs)[:, 0]
-    assert terms[4] == 0 or "ground" in kwargs
-    return terms if "ground" in kwargs else terms[:4]
+def terms_of(crane, d_combine, command, ground=None, **kwargs):
+    """The terms of the reward of one crane, without r_ground if no force is given."""
+    given = [np.array([d_combine]), crane_env.log_clearance(crane), crane_env.centre_miss(crane)]
+    given += [command, np.zeros(1) if ground is None else ground]
+    terms = crane_env.reward_terms(crane, *given, **kwargs)[:, 0]
+    assert ground is not None or terms[4] == 0
+    return terms[:4] if ground is None else terms
 
 
 def test_staged_reward():
@@ -149,11 +150,13 @@ def test_carrying_the_log_pays_before_it_rises():
 
 
 def test_hitting_the_ground_costs():
-    """In proportion to the force, up to three times the gentle one; nothing in the paper's form."""
+    """From 15 to 25 kN, less in an easy task; nothing in the paper's form."""
     here = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1])
-    for force, expected in [(0.0, 0.0), (10e3, -1.5), (20e3, -3.0), (60e3, -9.0), (90e3, -9.0)]:
+    for force, expected in [(0.0, 0.0), (15e3, 0.0), (20e3, -5.0), (25e3, -10.0), (90e3, -10.0)]:
         terms = terms_of(here, 0.4, COMMAND, ground=np.array([force]))
         assert terms[4] == pytest.approx(expected)
+        easy = terms_of(here, 0.4, COMMAND, ground=np.array([force]), difficulty=0.5)
+        assert easy[4] == pytest.approx(expected / 4)
         np.testing.assert_array_equal(terms[:4], terms_of(here, 0.4, COMMAND))
         assert terms_of(here, 0.4, COMMAND, ground=np.array([force]), kind="paper")[4] == 0
 
@@ -344,7 +347,9 @@ def test_reward_is_the_sum_of_the_reported_terms(reward):
     now = envs.state()
     measured = info["d_combine"], crane_env.log_clearance(now), crane_env.centre_miss(now)
     command = np.tile(0.5 * REAL[1], (4, 1))
-    np.testing.assert_allclose(terms, crane_env.reward_terms(now, *measured, command, 0.0, reward))
+    np.testing.assert_allclose(
+        terms, crane_env.reward_terms(now, *measured, command, np.zeros(4), 1.0, reward)
+    )
 
 
 def test_time_to_reach_is_the_first_time():

@@ -432,18 +432,19 @@ def test_killed_run_goes_on(tmp_path, run_here, algorithm):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_curriculum_goes_on_where_it_was(tmp_path, run_here, algorithm):
-    arguments = ["--env.curriculum", "--eval-every", "0", "--total-timesteps", "128"]
-    run_here(algorithm, *small(algorithm), *arguments)
-    path = only_run(tmp_path) / "checkpoint.pt"
-    checkpoint = torch.load(path, weights_only=True)
-    assert checkpoint["difficulty"] == 0 and checkpoint["iteration"] == 2
-    torch.save(checkpoint | {"difficulty": 0.35, "iteration": 1}, path)
-    left = run_here(algorithm, "--resume", path.parent)
-    assert left["envs"].unwrapped.difficulty == 0.35
-    assert left["first_iteration"] == 2 and left["args"].env["curriculum"]
-    assert left["report"]["charts/difficulty"] == 0.35
-    assert torch.load(path, weights_only=True)["difficulty"] == 0.35
+def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, algorithm):
+    """To that of the options, which the rest of the run has, also when it is resumed."""
+    arguments = [*small(algorithm), "--eval-every", "0", "--total-timesteps", "512"]
+    arguments += ["--warm-up", "0.5", "--env.difficulty", "0.8", "--final-trials", "0"]
+    run_here(algorithm, *arguments)
+    folder = only_run(tmp_path)
+    difficulties = scalars(folder)["charts/difficulty"]
+    np.testing.assert_allclose(difficulties, [0.2, 0.4, 0.6, 0.8, 0.8, 0.8, 0.8, 0.8], rtol=1e-6)
+    path = folder / "checkpoint.pt"
+    torch.save(torch.load(path, weights_only=True) | {"iteration": 2}, path)
+    left = run_here(algorithm, "--resume", folder)
+    assert left["first_iteration"] == 3 and left["envs"].unwrapped.difficulty == 0.8
+    np.testing.assert_allclose(scalars(folder)["charts/difficulty"][2:4], [0.6, 0.8], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -505,7 +506,7 @@ def test_a_stop_during_an_evaluation_keeps_the_update(
         os.kill(os.getpid(), signal.SIGINT)
         return evaluate(*args, **kwargs)
 
-    monkeypatch.setattr(crane_env, "evaluate", interrupted)
+    monkeypatch.setattr(crane_trials, "evaluate", interrupted)
     arguments = "--env-id recall_env:Echo-v0 --env.retry 0 --eval-every 1 --total-timesteps 320"
     with pytest.raises(SystemExit) as end:
         run_here(algorithm, *small(algorithm), *arguments.split())
@@ -537,7 +538,7 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
     ours = {"algorithm": algorithm, "task": task, "args": args}
     (tmp_path / "policy").mkdir()
     torch.save({**ours, "weights": {}, "global_step": 64}, tmp_path / "policy" / "checkpoint.pt")
-    ours |= {"weights": {}, "optimizer": {}, "iteration": 1, "difficulty": 1.0}
+    ours |= {"weights": {}, "optimizer": {}, "iteration": 1}
     for name, change in {
         "other": {"algorithm": "other"},
         "task": {"task": task | {"revision": crane_env.REVISION - 1}},

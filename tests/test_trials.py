@@ -1,4 +1,4 @@
-"""What training and judging share in crane_env.py: environments, reports, trials."""
+"""What training and judging share in crane_trials.py: environments, reports, trials."""
 
 from collections import deque
 from types import SimpleNamespace
@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode
 import crane_env
 import crane_trials
 import eval_crane
-from crane_env import CraneVectorEnv, make_envs, rollout_report, run_trials
+from crane_env import CraneVectorEnv
+from crane_trials import make_envs, rollout_report, run_trials
 from scripted_crane import ScriptedCrane
 
 
@@ -229,7 +230,7 @@ def test_training_and_judging_agree():
     np.testing.assert_array_equal(success, ~idle)
     assert 3 <= success.sum() <= 9
 
-    training = {"curriculum": True, "retry": 1.0, "difficulty": 0.0}  # an evaluation has none
+    training = {"retry": 1.0, "difficulty": 0.0}  # an evaluation has none
     scores = crane_trials.evaluate(policy, "ForestryCrane-v0", trials, seed, 1, **training)
     assert scores.pop("episodic_return") == pytest.approx(returns.mean())
     assert scores.pop("success_rate") == pytest.approx(success.mean())

@@ -1,0 +1,211 @@
+"""Table III: policies on the three levels, what their trials cost, and how robust they are.
+
+    python benchmark/levels.py table     # shipped policies and the scripted crane, on every level
+    python benchmark/levels.py sweeps    # the same on a hydraulic crane with one thing changed
+    python benchmark/levels.py draw      # assets/figures/robustness.svg from the sweeps
+
+The levels are ideal (ForestryCrane-v0), hydraulic (ForestryCraneHydraulic-v0) and randomized
+(ForestryCraneRandomized-v0). assets/policies/<script>.pt was trained on the first level,
+<script>_<level>.pt on the others. `table` writes benchmark/levels.csv, `sweeps` writes
+benchmark/robustness.csv, half an hour each. Rows that a file has already are not measured again.
+"""
+
+import csv
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+import tyro
+from mujoco import MjModel
+from tqdm import tqdm
+from tyro.conf import Positional
+
+import crane_env
+import crane_trials
+import eval_crane
+import machine
+from crane_env import CraneVectorEnv, Range, Seed
+from scripted_crane import ScriptedCrane
+
+HERE = Path(__file__).parent
+POLICIES = HERE.parent / "assets" / "policies"
+FIGURE = HERE.parent / "assets" / "figures" / "robustness.svg"
+LEVELS = {
+    "ideal": "ForestryCrane-v0",
+    "hydraulic": "ForestryCraneHydraulic-v0",
+    "randomized": "ForestryCraneRandomized-v0",
+}
+METHODS = {
+    "mPPO": "mppo_beta_crane",
+    "PPO": "ppo_crane",
+    "TRPO": "trpo_crane",
+    "recurrent PPO": "recurrent_ppo_crane",
+    "scripted": None,
+}
+SWEEPS = {  # what is changed, and to what; None has a value for the machine as it is
+    "more dead time [s]": [0.0, 0.03, 0.06, 0.09, 0.12],
+    "constant pose error [m]": [0.0, 0.05, 0.1, 0.15, 0.2, 0.3],
+    "passive damping, times": [0.25, 0.5, 1.0, 2.0, 5.0, 10.0],
+    "pump, times": [0.4, 0.6, 0.8, 1.0, 1.5],
+    "supply pressure, times": [0.4, 0.6, 0.8, 1.0],
+}
+
+
+def policy_of(method: str, level: str) -> tuple[Any, dict[str, Any]] | None:
+    """A shipped policy and the task it was trained on, None if there is none."""
+    if METHODS[method] is None:
+        return ScriptedCrane(level=level), {"sensors": False}
+    path = POLICIES / f"{METHODS[method]}{'' if level == 'ideal' else f'_{level}'}.pt"
+    return eval_crane.load_policy(path)[:2] if path.is_file() else None
+
+
+def judge(
+    policy: Any, task: dict[str, Any], level: str, trials: int, seed: int
+) -> dict[str, float]:
+    """Success in % and medians of the costs, in trials per diameter on a level."""
+    diameters, seeds = crane_trials.monte_carlo_trials(seed, trials)
+    options = {"diameter": diameters, "sensors": task["sensors"]}
+    envs = crane_trials.make_envs(LEVELS[level], len(seeds), **options)
+    results = crane_trials.run_trials(policy, envs, seeds)
+    envs.close()
+    won = results["success"]
+    return {
+        "trials": len(seeds),
+        "success": 100 * won.mean(),
+        "gentle": 100 * results["gentle"].mean(),
+        "ground_peak_kN": np.median(results["ground_peak"]) / 1e3,
+        "energy_kJ": np.median(results["energy"]) / 1e3,
+        "litres": np.median(results["litres"]),
+        "time_up_s": np.median(results["time_up"][won]) if won.any() else np.nan,
+    }
+
+
+@contextmanager
+def changed(what: str, value: float) -> Iterator[None]:
+    """The hydraulic crane with one thing changed, for cranes made here."""
+    load_model, dead_time, pump = crane_env.load_model, machine.DEAD_TIME, machine.PUMP_FLOW
+    draw_errors = CraneVectorEnv.start_episodes
+
+    def changed_model(*args: Any, **kwargs: Any) -> MjModel:
+        model = load_model(*args, **kwargs)
+        if what.startswith("passive"):
+            for name in ("q5", "q6"):
+                model.dof_damping[model.joint(name).dofadr] *= value
+        if what.startswith("supply"):
+            model.jnt_actfrcrange *= value
+        return model
+
+    def with_pose_error(envs: CraneVectorEnv, ids: np.ndarray) -> tuple:
+        angle = np.random.default_rng(0).uniform(0, 2 * np.pi, envs.num_envs)
+        error = [np.cos(angle), np.sin(angle), 0 * angle]
+        envs.drawn["pose_error"] = value * np.stack(error, axis=-1)
+        return draw_errors(envs, ids)
+
+    crane_env.load_model = changed_model
+    if what.startswith("more"):
+        machine.DEAD_TIME, machine.MAX_DELAY = dead_time + value, 64
+    if what.startswith("pump"):
+        machine.PUMP_FLOW = pump * value
+    if what.startswith("constant"):
+        CraneVectorEnv.start_episodes = with_pose_error
+    try:
+        yield
+    finally:
+        crane_env.load_model, machine.DEAD_TIME, machine.PUMP_FLOW = load_model, dead_time, pump
+        CraneVectorEnv.start_episodes = draw_errors
+
+
+def append(path: Path, keys: tuple[str, ...], jobs: list[dict], measure: Callable) -> None:
+    """Measure the jobs that have no row in a CSV file yet, and write each row as it comes."""
+    rows = []
+    if path.is_file():
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+    done = {tuple(row[key] for key in keys) for row in rows}
+    for job in tqdm(jobs, unit="cell"):
+        if tuple(str(job[key]) for key in keys) in done:
+            continue
+        results = measure(job)
+        if results is None:
+            continue
+        rows.append(job | {name: f"{value:.4g}" for name, value in results.items()})
+        with eval_crane.whole_file(path) as part, open(part, "w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0].keys())
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def draw(rows: list[dict[str, str]]) -> None:
+    """One panel for each thing that is changed, one line for each method."""
+    figure, panels = plt.subplots(1, len(SWEEPS), figsize=(16, 3.4), sharey=True)
+    for what, panel in zip(SWEEPS, panels):
+        for method in METHODS:
+            points = [r for r in rows if r["changed"] == what and r["method"] == method]
+            if points:
+                x, y = ([float(r[key]) for r in points] for key in ("value", "success"))
+                panel.plot(x, y, "o-", markersize=4, label=method)
+        panel.set_xlabel(what)
+        panel.set_ylim(0, 102)
+        panel.grid(alpha=0.3)
+        if what.startswith("passive"):
+            panel.set_xscale("log")
+    panels[0].set_ylabel("success [%]")
+    panels[-1].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(FIGURE)
+    print(f"written to {FIGURE}")
+
+
+def main(
+    what: Positional[Literal["table", "sweeps", "draw"]],
+    trials: Annotated[int, Range(1, 10_000)] = 100,
+    seed: Seed = 40_000,
+) -> None:
+    """trials: per log diameter; seed: of the trials."""
+    crane_env.check({"trials": trials, "seed": seed}, main)
+    torch.set_num_threads(1)
+    if what == "table":
+        jobs = [
+            {"method": method, "trained_on": trained_on, "judged_on": judged_on}
+            for method in METHODS
+            for trained_on in LEVELS
+            for judged_on in LEVELS
+        ]
+
+        def measure(job: dict) -> dict[str, float] | None:
+            found = policy_of(job["method"], job["trained_on"])
+            return found and judge(*found, job["judged_on"], trials, seed)
+
+        append(HERE / "levels.csv", ("method", "trained_on", "judged_on"), jobs, measure)
+    elif what == "sweeps":
+        jobs = [
+            {"method": method, "changed": thing, "value": value}
+            for thing, values in SWEEPS.items()
+            for value in values
+            for method in METHODS
+        ]
+
+        def measure(job: dict) -> dict[str, float] | None:
+            found = policy_of(job["method"], "hydraulic")
+            with changed(job["changed"], job["value"]):
+                return found and judge(*found, "hydraulic", trials, seed)
+
+        append(HERE / "robustness.csv", ("method", "changed", "value"), jobs, measure)
+    else:
+        with open(HERE / "robustness.csv", newline="") as file:
+            draw(list(csv.DictReader(file)))
+
+
+if __name__ == "__main__":
+    crane_trials.one_line_errors()
+    tyro.cli(main, description=__doc__)
