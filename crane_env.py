@@ -123,7 +123,7 @@ TIME_LIMIT = 9.0  # s, of an episode
 REACH_TIME = 6.0  # s, by which the log must have been reached
 REACH_DISTANCE = 0.35  # m, d_combine below which the log is reached
 LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre
-LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.012 rad or 0.016 m
+LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.005 rad or 0.012 m
 HOLD_TIME = 0.5  # s at the end of an episode in which the log must be held
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
 MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
@@ -138,8 +138,7 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 10.0  # what r_ground takes away at the second of these forces, in the full task
-GROUND_FORCES = (15e3, 25e3)  # N, of the crane on the ground, where r_ground begins and ends
+GROUND_WEIGHT = 30.0  # what r_ground takes away at GENTLE_FORCE, from nothing at half of it
 
 SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
     "real": np.array(
@@ -435,8 +434,8 @@ def reward_terms(
         centred = np.exp(-((miss / LIFT_MISS) ** 2))
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
-        low, high = GROUND_FORCES
-        r_ground = -GROUND_WEIGHT * difficulty**2 * np.clip((ground - low) / (high - low), 0, 1)
+        hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, 1)
+        r_ground = -GROUND_WEIGHT * difficulty**2 * hardness
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 

@@ -169,7 +169,7 @@ def test_small_swing_is_that_of_a_damped_compound_pendulum(joint):
         torque_arm += model.body_mass[body] * arm
         mass += model.body_mass[body]
     stiffness = 9.81 * np.linalg.norm(np.cross(axis, torque_arm))
-    decay = 200.0 / (2 * inertia)
+    decay = model.dof_damping[model.joint(joint).dofadr[0]] / (2 * inertia)
     expected = 2 * np.pi / np.sqrt(stiffness / inertia - decay**2)
 
     q[0, index] += 0.05
