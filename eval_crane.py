@@ -45,7 +45,7 @@ from crane_env import (
     Threads,
 )
 from crane_trials import make_envs, monte_carlo_trials, run_trials
-from scripted_crane import ScriptedCrane
+from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
 ALGORITHMS = {script.ALGORITHM: script for script in SCRIPTS}
@@ -379,12 +379,14 @@ def main() -> None:
         policy, task, name = load_policy(args.path)
         source = str(args.path)
     else:
-        policy = ScriptedCrane(args.signed_yaw)
-        if args.policy != "scripted":
-            policy = FixedPolicy(args.policy, args.seed)
+        policy = FixedPolicy(args.policy, args.seed)
         name = source = args.policy
     env_id, options = task_of(args, task)
-    contact = make_envs(env_id, 1, **options).unwrapped.options["contact"]
+    all_options = make_envs(env_id, 1, **options).unwrapped.options
+    contact = all_options["contact"]
+    if args.policy == "scripted":
+        settings = HYDRAULIC if all_options["actuators"] == "hydraulic" else IDEAL
+        policy = ScriptedCrane(args.signed_yaw, settings)
     torch.set_num_threads(1)  # the batches are too small for more
     if args.video or args.viewer:
         torch.manual_seed(args.seed)
@@ -408,6 +410,7 @@ def main() -> None:
             mean = sum(cell["successes"] for cell in cells) / len(records)
             answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
             answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
+            answer["mean_gentle_rate"] = sum(r["gentle"] for r in records) / len(records)
             print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"

@@ -19,11 +19,16 @@ for, and its swing s = p_C - p_plumb is damped by letting the tip follow it:
     v = bound(k_p (Delta_p + s + h)) + k_s s     k_s s horizontal, v's change bounded too
     s'' = -omega^2 s - x''                of the tip at x; with x' = k_s s its damping is k_s s'
 
+Hydraulic drives answer late. There Delta_p and s are predicted by the latency T of the drives:
+Delta_p - T v for the last command v, and s + T s'. Two `Settings` hold the gains of the two drives.
+
 Phases of each crane: APPROACH (over the log, turning along it), DESCEND, CLOSE, LIFT.
 
     python eval_crane.py --policy scripted                    # --video and --viewer work too
     python eval_crane.py --policy scripted --no-signed-yaw    # finds the angle's sign by turning
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,19 +51,36 @@ LOW, HIGH = SPEEDS["real"][:, :5]  # speed limits of q1 ... q4, q7, rad/s and m/
 SPEED = np.minimum(-LOW, HIGH)
 
 DAMPING = 0.1  # lambda, m/s at full joint speed; J's smallest singular value in the task: 0.85
-K_P = 1.5  # 1/s; half the pendulum's omega of 3 rad/s, so as not to drive it
-K_S = 2.5  # 1/s; adds k_s / (2 omega) = 0.4 to the damping ratio: swings of 0.27, not 0.32 rad
-MAX_SPEED = 2.0  # m/s; 95 % of the ways are below 5.3 m, and 6 s must suffice
-MAX_ACCELERATION = 2.0  # m/s^2; leans the grapple by 0.2 rad, a quarter of what q6 allows
 K_YAW = 3.0  # 1/s; from pi/2 to 0.1 rad in one second
 Q7_MAX = np.pi / 2 + 0.2  # rad; goals start within pi/2, pose errors move them by less than 0.2
-Q8_OPEN = 0.4  # rad; tips 2.2 m apart and, hovering, 0.15 m above the top of a 0.8 m log
-HOVER = 0.4  # m above the closing height; the tips then pass over the log
-NEAR, NEARLY_ALIGNED = 0.5, 0.2  # m, rad; to descend: open tips come down beside the log
-OVER, LEVEL, ALIGNED = 0.12, 0.03, 0.1  # m, m, rad; to close: higher up, tips only pinch a thin log
-Q8_CLOSED, STALLED = 1.2, 0.1  # rad, rad/s; gripped: a 0.8 m log stops the jaws at 1.75 rad
+NEARLY_ALIGNED = 0.2  # rad; to descend
+Q8_CLOSED = 1.2  # rad; gripped: a 0.8 m log stops the jaws at 1.75 rad
 CARRY_HEIGHT = 1.2  # m, of p_C; the log then hangs 0.8 m or more above the ground
 APPROACH, DESCEND, CLOSE, LIFT = range(4)
+
+
+class Settings(NamedTuple):
+    """What depends on the drives. IDEAL was set by hand, HYDRAULIC by a random search (docs)."""
+
+    k_p: float = 1.5  # 1/s; half the pendulum's omega of 3 rad/s, so as not to drive it
+    k_s: float = 2.5  # 1/s; adds k_s / (2 omega) = 0.4 to the damping ratio of the swing
+    latency: float = 0.0  # s, T
+    max_speed: float = 2.0  # m/s; 95 % of the ways are below 5.3 m, and 6 s must suffice
+    max_acceleration: float = 2.0  # m/s^2; leans the grapple by 0.2 rad, a quarter of q6's range
+    q8_open: float = 0.4  # rad; tips 2.2 m apart and, hovering, 0.15 m above a 0.8 m log
+    hover: float = 0.4  # m above the closing height; the tips then pass over the log
+    near: float = 0.5  # m; to descend: open tips come down beside the log
+    over: float = 0.12  # m; to close, and
+    level: float = 0.03  # m; higher up, tips only pinch a thin log
+    aligned: float = 0.1  # rad
+    clearance: float = 0.0  # m, of the tips above the ground when they close
+    jaw_speed: float = 1.0  # to close, fraction of q8's limit
+    squeeze: float = 1.0  # the same while lifting
+    stalled: float = 0.1  # rad/s; slower jaws have gripped
+
+
+IDEAL = Settings()
+HYDRAULIC = Settings(k_s=0.7, latency=0.3, max_acceleration=1.0)
 
 
 def forward_kinematics(q: np.ndarray) -> np.ndarray:
@@ -122,23 +144,24 @@ def bounded(vector: np.ndarray, length: float) -> np.ndarray:
 
 
 class ScriptedCrane:
-    """Maps observations (N, 18) of ForestryCrane-v0 to actions (N, 6)."""
+    """Maps observations (N, 18 or more) of ForestryCrane-v0 to actions (N, 6)."""
 
-    def __init__(self, signed_yaw: bool = True):
-        self.signed_yaw = signed_yaw
+    def __init__(self, signed_yaw: bool = True, settings: Settings = IDEAL):
+        self.signed_yaw, self.settings = signed_yaw, settings
 
     def predict(
         self, obs: np.ndarray, state: "ScriptedCrane | None" = None, deterministic: bool = True
     ) -> tuple[np.ndarray, "ScriptedCrane"]:
         """Actions (N, 6) and the memory of this batch of trials. None starts new trials."""
         if state is None:
-            state = ScriptedCrane(self.signed_yaw)
+            state = ScriptedCrane(self.signed_yaw, self.settings)
             state.start(len(obs))
         return state.act(obs), state
 
     def start(self, cranes: int) -> None:
         self.phase = np.full(cranes, APPROACH)
         self.velocity = np.zeros((cranes, 3))  # commanded last, m/s
+        self.swing = None  # (N, 3) m, before
         self.q7_goal = np.zeros(cranes)  # rad, over the log
         self.log_yaw = None  # (N, 2) rad, where the log may lie by the first observation
         self.doubt = np.zeros((cranes, 2))  # how badly either has predicted Delta_psi since
@@ -160,7 +183,7 @@ class ScriptedCrane:
         return np.copysign(angle, better)
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        obs = np.asarray(obs, dtype=np.float64)
+        obs, settings = np.asarray(obs, dtype=np.float64), self.settings
         q, q8, q8_speed = obs[:, :8], obs[:, 7], obs[:, 13]
         # Delta_p comes along the crane's axes; this controller works along the world's
         cos, sin, (ahead, left, up) = np.cos(q[:, 0]), np.sin(q[:, 0]), obs[:, 14:17].T
@@ -168,6 +191,8 @@ class ScriptedCrane:
         frames, plumb_frames = forward_kinematics(q), forward_kinematics(plumb(q))
         p_centre, p_plumb = grapple_centre(frames), grapple_centre(plumb_frames)
         swing = p_centre - p_plumb
+        swing_rate = 0 * swing if self.swing is None else (swing - self.swing) / DT
+        self.swing = swing
         angle = obs[:, 17]
         if not self.signed_yaw:
             angle = self.find_signed_angle(angle, frames[-1, :, :3, 0])
@@ -180,23 +205,24 @@ class ScriptedCrane:
         self.q7_goal = np.where(np.abs(goal) > Q7_MAX, half_turn(goal), goal)
         turn = q[:, 6] + slew - self.q7_goal
 
-        away, height = np.linalg.norm(delta_p[:, :2], axis=-1), np.abs(delta_p[:, 2])
-        near = (away < NEAR) & (np.abs(turn) < NEARLY_ALIGNED)
-        in_place = (away < OVER) & (height < LEVEL) & (np.abs(turn) < ALIGNED)
-        gripped = (q8 > Q8_CLOSED) & (q8_speed < STALLED)
+        away = np.linalg.norm(delta_p[:, :2], axis=-1)
+        level = np.abs(delta_p[:, 2] + settings.clearance) < settings.level
+        near = (away < settings.near) & (np.abs(turn) < NEARLY_ALIGNED)
+        in_place = (away < settings.over) & level & (np.abs(turn) < settings.aligned)
+        gripped = (q8 > Q8_CLOSED) & (q8_speed < settings.stalled)
         self.phase[(self.phase == APPROACH) & near] = DESCEND
         self.phase[(self.phase == DESCEND) & in_place] = CLOSE
         self.phase[(self.phase == CLOSE) & gripped] = LIFT
         hovering, lifting = self.phase == APPROACH, self.phase == LIFT
 
         # Delta_p,z is 0 where the jaws' tips just clear the ground, whatever the log's diameter.
-        way = delta_p + swing
-        way[hovering, 2] += HOVER
+        way = delta_p + swing - settings.latency * self.velocity
+        way[:, 2] += np.where(hovering, settings.hover, settings.clearance)
         way[lifting] = 0.0
         way[lifting, 2] = CARRY_HEIGHT - p_plumb[lifting, 2]
-        wanted = bounded(K_P * way, MAX_SPEED)
-        wanted[:, :2] += K_S * swing[:, :2]
-        self.velocity += bounded(wanted - self.velocity, MAX_ACCELERATION * DT)
+        wanted = bounded(settings.k_p * way, settings.max_speed)
+        wanted[:, :2] += settings.k_s * (swing + settings.latency * swing_rate)[:, :2]
+        self.velocity += bounded(wanted - self.velocity, settings.max_acceleration * DT)
         yaw_rate = np.where(lifting, 0.0, K_YAW * turn)
 
         task = np.concatenate([self.velocity, yaw_rate[:, None]], axis=-1)
@@ -204,7 +230,9 @@ class ScriptedCrane:
         fractions = np.where(rates < 0, -rates / LOW, rates / HIGH)
         # too fast for a joint: all slow down and the direction stays; the rotator alone is clipped
         fractions /= np.maximum(1.0, np.abs(fractions[:, :4]).max(axis=-1, keepdims=True))
-        jaws = np.where(self.phase >= CLOSE, 1.0, (Q8_OPEN - q8) / (DT * SPEEDS["real"][1, 5]))
+        jaws = (settings.q8_open - q8) / (DT * SPEEDS["real"][1, 5])
+        jaws = np.where(self.phase == CLOSE, settings.jaw_speed, jaws)
+        jaws = np.where(lifting, settings.squeeze, jaws)
         return np.clip(np.concatenate([fractions, jaws[:, None]], axis=-1), -1.0, 1.0)
 
 

@@ -35,7 +35,7 @@ import crane_trials
 import eval_crane
 import machine
 from crane_env import CraneVectorEnv, Range, Seed
-from scripted_crane import ScriptedCrane
+from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 HERE = Path(__file__).parent
 POLICIES = HERE.parent / "assets" / "policies"
@@ -52,7 +52,7 @@ METHODS = {
     "recurrent PPO": "recurrent_ppo_crane",
     "scripted": None,
 }
-SWEEPS = {  # what is changed, and to what; None has a value for the machine as it is
+SWEEPS = {  # what is changed, and to what
     "more dead time [s]": [0.0, 0.03, 0.06, 0.09, 0.12],
     "constant pose error [m]": [0.0, 0.05, 0.1, 0.15, 0.2, 0.3],
     "passive damping, times": [0.25, 0.5, 1.0, 2.0, 5.0, 10.0],
@@ -64,7 +64,8 @@ SWEEPS = {  # what is changed, and to what; None has a value for the machine as 
 def policy_of(method: str, level: str) -> tuple[Any, dict[str, Any]] | None:
     """A shipped policy and the task it was trained on, None if there is none."""
     if METHODS[method] is None:
-        return ScriptedCrane(level=level), {"sensors": False}
+        settings = {"ideal": IDEAL, "hydraulic": HYDRAULIC}  # a random machine is hydraulic too
+        return level in settings and (ScriptedCrane(settings=settings[level]), {"sensors": False})
     path = POLICIES / f"{METHODS[method]}{'' if level == 'ideal' else f'_{level}'}.pt"
     return eval_crane.load_policy(path)[:2] if path.is_file() else None
 
@@ -93,8 +94,8 @@ def judge(
 @contextmanager
 def changed(what: str, value: float) -> Iterator[None]:
     """The hydraulic crane with one thing changed, for cranes made here."""
-    load_model, dead_time, pump = crane_env.load_model, machine.DEAD_TIME, machine.PUMP_FLOW
-    draw_errors = CraneVectorEnv.start_episodes
+    load_model, start_episodes = crane_env.load_model, CraneVectorEnv.start_episodes
+    dead_time, max_delay, pump = machine.DEAD_TIME, machine.MAX_DELAY, machine.PUMP_FLOW
 
     def changed_model(*args: Any, **kwargs: Any) -> MjModel:
         model = load_model(*args, **kwargs)
@@ -109,11 +110,11 @@ def changed(what: str, value: float) -> Iterator[None]:
         angle = np.random.default_rng(0).uniform(0, 2 * np.pi, envs.num_envs)
         error = [np.cos(angle), np.sin(angle), 0 * angle]
         envs.drawn["pose_error"] = value * np.stack(error, axis=-1)
-        return draw_errors(envs, ids)
+        return start_episodes(envs, ids)
 
     crane_env.load_model = changed_model
     if what.startswith("more"):
-        machine.DEAD_TIME, machine.MAX_DELAY = dead_time + value, 64
+        machine.DEAD_TIME, machine.MAX_DELAY = dead_time + value, 2 * max_delay
     if what.startswith("pump"):
         machine.PUMP_FLOW = pump * value
     if what.startswith("constant"):
@@ -121,8 +122,8 @@ def changed(what: str, value: float) -> Iterator[None]:
     try:
         yield
     finally:
-        crane_env.load_model, machine.DEAD_TIME, machine.PUMP_FLOW = load_model, dead_time, pump
-        CraneVectorEnv.start_episodes = draw_errors
+        crane_env.load_model, CraneVectorEnv.start_episodes = load_model, start_episodes
+        machine.DEAD_TIME, machine.MAX_DELAY, machine.PUMP_FLOW = dead_time, max_delay, pump
 
 
 def append(path: Path, keys: tuple[str, ...], jobs: list[dict], measure: Callable) -> None:
@@ -136,7 +137,7 @@ def append(path: Path, keys: tuple[str, ...], jobs: list[dict], measure: Callabl
         if tuple(str(job[key]) for key in keys) in done:
             continue
         results = measure(job)
-        if results is None:
+        if not results:
             continue
         rows.append(job | {name: f"{value:.4g}" for name, value in results.items()})
         with eval_crane.whole_file(path) as part, open(part, "w", newline="") as file:

@@ -1,5 +1,8 @@
 """The machine's drives: its measured step responses, valves, pump, what the policy sees of them."""
 
+import sys
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -410,3 +413,34 @@ def test_randomize_without_hydraulics():
     for _ in range(30):
         obs, *_ = envs.step(np.ones((4, 6)))
     assert obs in envs.observation_space
+
+
+# ---- benchmark/levels.py
+
+
+def test_a_sweep_changes_one_thing_and_puts_it_back():
+    sys.path.insert(0, str(Path(__file__).parent.parent / "benchmark"))
+    import levels
+
+    def measured():
+        envs = hydraulic(2)
+        envs.reset(seed=0)
+        model, q = envs.model, np.zeros((1, 3))
+        valves, fast = Valves(1), np.array([[0.8, 0.2, 0.3, 0.4, 2.0, 1.8]])
+        speed = [valves.mean_speed(np.array([0]), fast, q, 0.02) for _ in range(100)][-1]
+        return {
+            "more dead time [s]": model.actuator_delay[8],
+            "constant pose error [m]": np.linalg.norm(envs.drawn["pose_error"], axis=-1).max(),
+            "passive damping, times": model.dof_damping[model.joint("q5").dofadr[0]],
+            "pump, times": speed[0, 0],
+            "supply pressure, times": model.jnt_actfrcrange[0, 1],
+        }
+
+    before = measured()
+    for what, value in zip(before, [0.12, 0.2, 3.0, 0.5, 0.5]):
+        with levels.changed(what, value):
+            now = measured()
+        wanted = before[what] * value if "times" in what else before[what] + value
+        assert now.pop(what) == pytest.approx(wanted)
+        assert all(now[other] == pytest.approx(before[other]) for other in now)
+    assert measured() == before and set(before) == set(levels.SWEEPS)

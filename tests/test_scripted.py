@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import crane_env
-from crane_env import CraneVectorEnv, monte_carlo_trials
+from crane_env import CraneVectorEnv
+from crane_trials import monte_carlo_trials
 from scripted_crane import (
     DAMPING,
     SPEED,
