@@ -134,6 +134,7 @@ DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give 
 GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed the jaws
 LIFT_WEIGHT = 2.0  # largest staged r_lift
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
+CLOSING_HEIGHT = 0.1  # m above Delta_p = 0: closing jaws pull the grapple down, onto the ground
 NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
@@ -397,7 +398,7 @@ def centre_miss(state: CraneState) -> Array:
 
 def reward_terms(
     state: CraneState,
-    d_combine: Array,
+    distance: Array,
     clearance: Array,
     miss: Array,
     command: Array,
@@ -407,17 +408,18 @@ def reward_terms(
 ) -> Array:
     """The TERMS of the reward, which is their sum, (5, N).
 
-    d_combine (N,) is ||Delta_p|| + 1 m Delta_psi in m, clearance and miss (N,) in m are
-    `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and m/s,
-    ground (N,) the decision's largest force of crane on ground in N.
+    distance (N,) in m is d_combine = ||Delta_p|| + 1 m Delta_psi, for "staged" with a Delta_p that
+    is 0 CLOSING_HEIGHT higher. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
+    command (N, 6) the commanded velocities in rad/s and m/s, ground (N,) the decision's largest
+    force of crane on ground in N.
 
     kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
     the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
     r_ground punishes hitting the ground. An easy task forgives it: a crane that does not lift yet
     would learn to stay away.
     """
-    r_ground = np.zeros_like(d_combine)
-    r_distance = np.exp(-OMEGA2 * d_combine)
+    r_ground = np.zeros_like(distance)
+    r_distance = np.exp(-OMEGA2 * distance)
     closed = state.q[:, 7] / Q8_MAX
     if kind == "paper":
         r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
@@ -425,7 +427,7 @@ def reward_terms(
         r_lift = (1 - np.tanh(height_error)) * (1 - r_grapple)
         r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
     else:
-        near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (d_combine - REACH_DISTANCE)))
+        near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
         r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
         height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
@@ -836,8 +838,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         clearance, miss = log_clearance(state), centre_miss(state)
         kind = self.options["reward"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
+        above = 0.0 if kind == "paper" else CLOSING_HEIGHT
+        distance = np.linalg.norm(delta_p + [0, 0, above], axis=-1) + delta_psi
         terms = reward_terms(
-            state, d_combine, clearance, miss, command, self.hit, self.difficulty, kind
+            state, distance, clearance, miss, command, self.hit, self.difficulty, kind
         )
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
         if self.options["randomize"]:

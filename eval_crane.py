@@ -223,26 +223,27 @@ def summarize(records: list[dict]) -> list[dict]:
     return cells
 
 
-def print_table(records: list[dict], cells: list[dict], noise: str, title: str) -> None:
+def print_table(records: list[dict], cells: list[dict], paper: dict, title: str) -> None:
+    """Success by diameter beside the paper's % by diameter, if it has any."""
     print(f"\n{title}")
     print("| d [m] | paper % | ours % | 95 % interval | reach [s] | miss [m] | failures |")
     print("|-------|---------|--------|---------------|-----------|----------|----------|")
     for cell in cells:
         good = [r for r in records if r["success"] and r["diameter"] == cell["diameter"]]
-        paper = PAPER.get(noise, {}).get(cell["diameter"], "")
+        published = paper.get(cell["diameter"], "")
         reach = f"{np.mean([r['time_to_reach'] for r in good]):.2f}" if good else ""
         miss = f"{np.mean([r['centre_miss'] for r in good]):.3f}" if good else ""
         low, high = (100 * bound for bound in cell["interval"])
         failures = ", ".join(f"{name} {count}" for name, count in cell["failures"].items())
         print(
-            f"| {cell['diameter']:<5} | {paper:<7} | {100 * cell['success_rate']:<6.1f} "
+            f"| {cell['diameter']:<5} | {published:<7} | {100 * cell['success_rate']:<6.1f} "
             f"| {low:5.1f} - {high:5.1f} | {reach:<9} | {miss:<8} | {failures} |"
         )
     wins, trials = sum(c["successes"] for c in cells), sum(c["trials"] for c in cells)
     low, high = (100 * bound for bound in wilson_interval(wins, trials))
-    published = [PAPER.get(noise, {}).get(cell["diameter"]) for cell in cells]
-    paper = "" if None in published else f"{np.mean(published):.1f}"
-    print(f"| mean  | {paper:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
+    published = [paper.get(cell["diameter"]) for cell in cells]
+    mean = "" if None in published else f"{np.mean(published):.1f}"
+    print(f"| mean  | {mean:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
     print("Reach is the mean time until d_combine < 0.35 m. Miss is the mean distance from grip to")
     print("log centre, along the log. Both are means over the successes.")
     print_care(records, cells)
@@ -414,7 +415,10 @@ def main() -> None:
             print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
-            print_table(records, cells, noise, f"{TITLES[noise]}: {what}, seed {args.seed}")
+            papers_drives = all_options["actuators"] == "ideal"
+            paper = PAPER.get(noise, {}) if papers_drives else {}
+            title = TITLES[noise] if papers_drives else "Hydraulic drives"
+            print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")
     print(end="", flush=True)
 
 

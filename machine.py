@@ -13,10 +13,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 # Six numbers belong to q1, q2, q3, each telescope stage, q7 and q8.
-STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 5.0e4])  # N m/rad, N/m
-DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 1300.0])  # N m s/rad, N s/m
-LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.06])  # s, of the valve, first order
-DEAD_TIME = np.array([0.117, 0.081, 0.044, 0.060, 0.058, 0.060])  # s
+STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 1.23e4])  # N m/rad, N/m
+DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 757.0])  # N m s/rad, N s/m
+LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.130])  # s, of the valve, first order
+DEAD_TIME = np.array([0.117, 0.081, 0.044, 0.060, 0.058, 0.058])  # s
 BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
@@ -32,13 +32,13 @@ OIL = np.array(
 DRAWN = {
     "stiffness": (
         STIFFNESS,
-        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 2.5e4]),
-        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 7.5e4]),
+        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 2.55e3]),
+        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 1.24e4]),
     ),
     "damping": (
         DAMPING,
-        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 650.0]),
-        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 2600.0]),
+        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 62.9]),
+        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 1596.0]),
     ),
     "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
     "gain": (  # factor on the speed, of movements down and up
