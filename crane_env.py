@@ -93,7 +93,6 @@ if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
 import gymnasium
 import mujoco
 import numpy as np
-from filelock import FileLock
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -160,11 +159,8 @@ TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reac
 CONDITIONS = ["not_reached", "not_lifted", "not_held", "off_centre"]
 COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 CARE = ["gentle", *COSTS, "time_up", "log_speed"]
-RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
-RESULTS |= {*CONDITIONS, *CARE}
 Array = np.ndarray
 ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
-LOCKS: list[FileLock] = []  # of the folders in which this process trains
 
 
 # ---- options
@@ -308,26 +304,33 @@ def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
     return out, up
 
 
-def sample_start(rng: Generator, difficulty: float = 1.0) -> tuple[Array, Array, float]:
-    """Draw one start: q (8,), log pose (x, y, yaw) in m and rad, log diameter in m.
-
-    difficulty 1 is the full task. Smaller values draw the same start and then move the log towards
-    a point under the grapple, its yaw towards the grapple's, its diameter towards the mean one.
-    """
+def sample_start(rng: Generator) -> tuple[Array, Array, float]:
+    """Draw one start of the full task: q (8,), log pose (x, y, yaw) in m and rad, diameter in m."""
     good = np.zeros(1, bool)
     while not good.any():
         q2, q3, q4 = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3)).T
         out, up = tip_position(q2, q3, q4)
         good = (4.5 <= out) & (out <= 8) & (2.7 <= up) & (up <= 4.2) & (q2 + q3 > 0.05)
-    q2, q3, q4, out = np.stack([q2, q3, q4, out])[:, np.argmax(good)]
+    q2, q3, q4 = np.stack([q2, q3, q4])[:, np.argmax(good)]
     q1, azimuth = rng.uniform(-2 * np.pi / 3, -np.pi / 3, size=2)
     swing5, swing6 = rng.uniform(-0.05, 0.05, size=2)
     q7, yaw = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
     q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
     q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
+    return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
+
+def ease_start(
+    q: Array, log_pose: Array, diameter: float, difficulty: float
+) -> tuple[Array, Array, float]:
+    """A start of `sample_start` with its log moved towards an easy place, which difficulty 0 has.
+
+    The easy place is a point under the grapple, with the grapple's yaw and the mean diameter.
+    """
+    q1, q7, (x, y, yaw) = q[0], q[6], log_pose
+    out, _ = tip_position(*q[1:4])
     easiest = np.array([np.clip(out, 5.5, 7.5), q1, q1 - q7, (D_MIN + D_MAX) / 2])
-    way = np.array([radius, azimuth, yaw, diameter]) - easiest
+    way = np.array([np.hypot(x, y), np.arctan2(y, x), yaw, diameter]) - easiest
     way[2] = (way[2] + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
     radius, azimuth, yaw, diameter = easiest + difficulty * way
     yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
@@ -348,9 +351,7 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
-    carried: Array | float = (
-        0.0  # (N,) share of the log's weight that neither log nor crane puts on the ground
-    )
+    carried: Array | float = 0.0  # (N,) share of the log held up by the crane, which stands free
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
@@ -563,7 +564,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         begin = self.model.sensor_historyadr[-1] + 7
         self.ground_force = batch.bind("history")[:, begin : begin + 15]
         self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
-        _, integrators = np.split(self.model.actuator_gainprm, 2)  # after the velocity actuators
+        velocity, integrators = np.split(self.model.actuator_gainprm, 2)
+        self.servo_kv = velocity[:, 0]  # 0 of hydraulic drives
         self.servo_kp = np.tile(integrators[:, 0], (self.num_envs, 1))
         self.max_lead = self.model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp
         self.drawn = {
@@ -756,13 +758,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             if retry and failures and start_rng.random() < retry:
                 self.starts[i] = failures[start_rng.integers(len(failures))]
             else:
-                self.starts[i] = sample_start(start_rng, self.difficulty)
+                self.starts[i] = sample_start(start_rng)
             self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
             if share := self.options["randomize"]:
                 for name, (nominal, low, high) in DRAWN.items():
                     drawn = machine_rng.uniform(low, high)
                     self.drawn[name][i] = nominal + share * (drawn - nominal)
-        q, log_pose, diameter = (np.array(part) for part in zip(*[self.starts[i] for i in ids]))
+        starts = [self.starts[i] for i in ids]
+        if self.difficulty < 1:
+            starts = [ease_start(*start, self.difficulty) for start in starts]
+        q, log_pose, diameter = (np.array(part) for part in zip(*starts))
         q[:, 4:6] += self.drawn["swing"][ids]
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
@@ -860,8 +865,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         parts = [q, state.dq, delta_p, angle[:, None]]
         if self.options["sensors"]:
             limit = np.where(command < 0, -self.speed[0], self.speed[1])
-            lead = (self.act - self.qpos[:, SERVOS]) / self.max_lead
-            force = np.clip(lead[:, [0, 1, 2, 3, 5, 6]], -1, 1)
+            force = self.servo_kp * (self.act - self.qpos[:, SERVOS])
+            force += self.servo_kv * (self.ctrl[:, :8] - self.qvel[:, SERVOS])
+            limit_of_force = self.model.jnt_actfrcrange[SERVOS, 1]
+            force = np.clip(force / limit_of_force, -1, 1)[:, [0, 1, 2, 3, 5, 6]]
             parts += [command / limit, self.qvel[:, JOINTS][:, PASSIVE], force]
         obs = np.concatenate(parts, axis=-1)
         obs[np.isnan(obs)] = 0  # of a crane that diverged
@@ -878,7 +885,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def difficulty(self) -> float:
-        """Of the next starts; 0: easy, 1: the full task."""
+        """Of the next starts and, at once, of r_ground; 0: easy, 1: the full task."""
         return self._difficulty
 
     @difficulty.setter

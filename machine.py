@@ -16,12 +16,13 @@ from numpy import ndarray as Array
 STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 1.23e4])  # N m/rad, N/m
 DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 757.0])  # N m s/rad, N s/m
 LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.130])  # s, of the valve, first order
-DEAD_TIME = np.array([0.117, 0.081, 0.044, 0.060, 0.058, 0.058])  # s
+DEAD_TIME = np.array([0.117, 0.080, 0.044, 0.060, 0.058, 0.058])  # s
 BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
 PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
 MAX_PRESSURE = 25e6  # Pa, of the pump
+MIN_LEVER = 0.05  # m; below q2 = -1.1 rad the boom's two bars do not reach each other
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
 # The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
 OIL = np.array(
@@ -41,7 +42,7 @@ DRAWN = {
         np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 1596.0]),
     ),
     "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
-    "gain": (  # factor on the speed, of movements down and up
+    "gain": (  # factor on the speed, in the negative and the positive direction
         np.ones((2, 6)),
         np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
         np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
@@ -92,7 +93,7 @@ def cylinder_levers(q2: Array, q3: Array) -> Array:
 
     step = 1e-4
     levers = [(f(q + step) - f(q - step)) / (2 * step) for f, q in ((boom, q2), (arm, q3))]
-    return np.array(levers)
+    return np.maximum(levers, MIN_LEVER)
 
 
 def oil_per_movement(q: Array, dq: Array) -> Array:
@@ -121,7 +122,7 @@ class Valves:
         joints ask for more oil than the pump gives, all get the same share.
         """
         opening, telescope = self.opening[ids], command[:, 3]
-        resting = (np.abs(opening[:, 3]) < 1e-3) & (telescope != 0)
+        resting = (np.abs(opening[:, 3]) < 1e-3) & (np.abs(telescope) >= 1e-3)
         self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
         closed = resting & (self.telescope_wait[ids] <= BREAKAWAY)
         target = command.copy()

@@ -308,6 +308,13 @@ if __name__ == "__main__":
             writer.add_scalar(f"{name}/{key}", value, iteration * batch_size)
         return scores
 
+    def set_difficulty(iteration: int) -> None:
+        """Easy starts first: the difficulty rises to its full value in the warm-up."""
+        progress = iteration / num_iterations
+        share = progress / args.warm_up if progress < args.warm_up else 1.0
+        if is_crane:
+            envs.unwrapped.difficulty = full_difficulty * share
+
     def finish_update(iteration: int, report: dict[str, float]) -> None:
         """Write the report. Evaluate and save when it is time to, and stop if a signal came."""
         wrong = [name for name, value in report.items() if not np.isfinite(value)]
@@ -347,6 +354,7 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
+    set_difficulty(first_iteration)
     next_obs = to_tensor(envs.reset(seed=env_seed)[0])
     if not remaining:
         print(f"all {num_iterations} updates are done; more --total-timesteps extend the run")
@@ -359,10 +367,7 @@ if __name__ == "__main__":
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
-        if is_crane:
-            progress = iteration / num_iterations
-            share = progress / args.warm_up if progress < args.warm_up else 1.0
-            envs.unwrapped.difficulty = full_difficulty * share
+        set_difficulty(iteration)
 
         # Rollout
         rollout_start = time.time()

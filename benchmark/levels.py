@@ -7,7 +7,8 @@
 The levels are ideal (ForestryCrane-v0), hydraulic (ForestryCraneHydraulic-v0) and randomized
 (ForestryCraneRandomized-v0). assets/policies/<script>.pt was trained on the first level,
 <script>_<level>.pt on the others. `table` writes benchmark/levels.csv, `sweeps` writes
-benchmark/robustness.csv, half an hour each. Rows that a file has already are not measured again.
+benchmark/robustness.csv, half an hour each. Rows that a file has already are not measured again:
+delete the file when a policy has changed.
 """
 
 import csv
@@ -57,7 +58,7 @@ SWEEPS = {  # what is changed, and to what
     "constant pose error [m]": [0.0, 0.05, 0.1, 0.15, 0.2, 0.3],
     "passive damping, times": [0.25, 0.5, 1.0, 2.0, 5.0, 10.0],
     "pump, times": [0.4, 0.6, 0.8, 1.0, 1.5],
-    "supply pressure, times": [0.4, 0.6, 0.8, 1.0],
+    "force limits, times": [0.4, 0.6, 0.8, 1.0],
 }
 
 
@@ -102,7 +103,7 @@ def changed(what: str, value: float) -> Iterator[None]:
         if what.startswith("passive"):
             for name in ("q5", "q6"):
                 model.dof_damping[model.joint(name).dofadr] *= value
-        if what.startswith("supply"):
+        if what.startswith("force"):
             model.jnt_actfrcrange *= value
         return model
 
@@ -126,15 +127,15 @@ def changed(what: str, value: float) -> Iterator[None]:
         machine.DEAD_TIME, machine.MAX_DELAY, machine.PUMP_FLOW = dead_time, max_delay, pump
 
 
-def append(path: Path, keys: tuple[str, ...], jobs: list[dict], measure: Callable) -> None:
+def append(path: Path, jobs: list[dict], measure: Callable) -> None:
     """Measure the jobs that have no row in a CSV file yet, and write each row as it comes."""
     rows = []
     if path.is_file():
         with open(path, newline="") as file:
             rows = list(csv.DictReader(file))
-    done = {tuple(row[key] for key in keys) for row in rows}
+    done = [{key: row[key] for key in jobs[0]} for row in rows]
     for job in tqdm(jobs, unit="cell"):
-        if tuple(str(job[key]) for key in keys) in done:
+        if {key: str(value) for key, value in job.items()} in done:
             continue
         results = measure(job)
         if not results:
@@ -175,9 +176,10 @@ def main(
     """trials: per log diameter; seed: of the trials."""
     crane_env.check({"trials": trials, "seed": seed}, main)
     torch.set_num_threads(1)
+    protocol = {"per_diameter": trials, "seed": seed}
     if what == "table":
         jobs = [
-            {"method": method, "trained_on": trained_on, "judged_on": judged_on}
+            {"method": method, "trained_on": trained_on, "judged_on": judged_on, **protocol}
             for method in METHODS
             for trained_on in LEVELS
             for judged_on in LEVELS
@@ -187,10 +189,10 @@ def main(
             found = policy_of(job["method"], job["trained_on"])
             return found and judge(*found, job["judged_on"], trials, seed)
 
-        append(HERE / "levels.csv", ("method", "trained_on", "judged_on"), jobs, measure)
+        append(HERE / "levels.csv", jobs, measure)
     elif what == "sweeps":
         jobs = [
-            {"method": method, "changed": thing, "value": value}
+            {"method": method, "changed": thing, "value": value, **protocol}
             for thing, values in SWEEPS.items()
             for value in values
             for method in METHODS
@@ -201,7 +203,7 @@ def main(
             with changed(job["changed"], job["value"]):
                 return found and judge(*found, "hydraulic", trials, seed)
 
-        append(HERE / "robustness.csv", ("method", "changed", "value"), jobs, measure)
+        append(HERE / "robustness.csv", jobs, measure)
     else:
         with open(HERE / "robustness.csv", newline="") as file:
             draw(list(csv.DictReader(file)))

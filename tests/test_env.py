@@ -446,10 +446,23 @@ def test_difficulty():
     envs.reset(seed=0)
     delta_p, _, _ = crane_env.relative_pose(envs.state())
     assert easy.max() < 1.2 and np.linalg.norm(delta_p[:, :2], axis=-1).max() > 3
-    rng_easy, rng_full = np.random.default_rng(9), np.random.default_rng(9)
-    np.testing.assert_array_equal(
-        crane_env.sample_start(rng_easy, 0.3)[0], crane_env.sample_start(rng_full, 1.0)[0]
-    )
+    start = crane_env.sample_start(np.random.default_rng(9))
+    full = crane_env.ease_start(*start, 1.0)
+    for eased, drawn in zip(full, start):
+        np.testing.assert_allclose(eased, drawn, atol=1e-12)
+    np.testing.assert_array_equal(crane_env.ease_start(*start, 0.3)[0], start[0])
+
+
+def test_a_repeated_start_has_the_difficulty_of_now():
+    envs = CraneVectorEnv(8, difficulty=0.0, retry=1.0)
+    envs.reset(seed=0)
+    for i in range(8):
+        envs.failures[i].append(envs.starts[i])
+    ways = []
+    for envs.difficulty in (0.0, 1.0):
+        envs.start_episodes(np.arange(8))
+        ways.append(np.linalg.norm(crane_env.relative_pose(envs.state())[0][:, :2], axis=-1))
+    assert ways[0].max() < 1.2 and ways[1].mean() > 1.5
 
 
 def test_ends_are_recorded_as_they_come():

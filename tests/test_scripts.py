@@ -432,8 +432,18 @@ def test_killed_run_goes_on(tmp_path, run_here, algorithm):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, algorithm):
-    """To that of the options, which the rest of the run has, also when it is resumed."""
+def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, monkeypatch, algorithm):
+    """To that of the options, which the rest of the run has, also when it is resumed.
+
+    The first starts are easy too.
+    """
+    first, reset = [], crane_env.CraneVectorEnv.reset
+
+    def watched(envs, **kwargs):
+        first.append(envs.difficulty)
+        return reset(envs, **kwargs)
+
+    monkeypatch.setattr(crane_env.CraneVectorEnv, "reset", watched)
     arguments = [*small(algorithm), "--eval-every", "0", "--total-timesteps", "512"]
     arguments += ["--warm-up", "0.5", "--env.difficulty", "0.8", "--final-trials", "0"]
     run_here(algorithm, *arguments)
@@ -445,6 +455,7 @@ def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, algorithm):
     left = run_here(algorithm, "--resume", folder)
     assert left["first_iteration"] == 3 and left["envs"].unwrapped.difficulty == 0.8
     np.testing.assert_allclose(scalars(folder)["charts/difficulty"][2:4], [0.6, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(first, [0.2, 0.6], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
