@@ -66,7 +66,7 @@ class Args:
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_env.Options = field(default_factory=lambda: {"retry": 0.0})
     """options of the crane; in parentheses: what ForestryCrane-v0 has"""
-    warm_up: Share = 0.5  # share of the run in which the crane's difficulty rises to its full value
+    warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
     num_steps: Size = 64  # decisions per crane and rollout
