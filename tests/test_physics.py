@@ -143,7 +143,16 @@ def test_moving_mass():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", ["q5", "q6"])
-def test_small_swing_is_that_of_a_damped_compound_pendulum(joint):
+def test_small_swing_is_that_of_a_damped_compound_pendulum(joint, monkeypatch):
+    """Its Coulomb friction aside, which holds it within friction / stiffness of its rest."""
+    load_model = crane_env.load_model
+
+    def without_friction(*args, **kwargs):
+        model = load_model(*args, **kwargs)
+        model.dof_frictionloss[:] = 0
+        return model
+
+    monkeypatch.setattr(crane_env, "load_model", without_friction)
     envs = place(HANGING, frame_skip=1)
     for _ in range(12_000):  # a minute, until it hangs still
         envs.advance(np.zeros((1, 6)))
@@ -184,6 +193,18 @@ def test_small_swing_is_that_of_a_damped_compound_pendulum(joint):
     period = 2 * np.mean(np.diff(crossings))
     assert mass > 200
     assert abs(period / expected - 1) < 0.02
+
+    monkeypatch.setattr(crane_env, "load_model", load_model)
+    envs = place(HANGING, frame_skip=1)
+    friction = envs.model.dof_frictionloss[model.joint(joint).dofadr[0]] / stiffness
+    assert 0.001 < friction < 0.01
+    for share, stays in ((0.5, True), (3.0, False)):
+        q[0, index] = rest + share * friction
+        envs.place(np.array([0]), q, np.array([[5.0, -6.0, 0.0]]), np.array([0.55]))
+        for _ in range(200):
+            envs.advance(np.zeros((1, 6)))
+        moved = abs(envs.state().q[0, index] - q[0, index])
+        assert (moved < 0.2 * friction) == stays
 
 
 def test_each_servo_settles_on_its_command():
