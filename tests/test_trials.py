@@ -221,11 +221,13 @@ def test_training_and_judging_agree():
     obs, _ = envs.reset(seed=seeds)
     idle, state, alive = obs[:, 6] > 0, None, np.ones(len(seeds), bool)
     returns, success = np.zeros(len(seeds)), np.zeros(len(seeds), bool)
+    gentle = np.zeros(len(seeds), bool)
     while alive.any():
         actions, state = policy.predict(obs, state)
         obs, reward, terminated, truncated, info = envs.advance(actions)
         returns += reward * alive
         success |= info["success"] & alive
+        gentle |= info["success"] & (info["ground_peak"] <= 20e3) & alive
         alive &= ~(terminated | truncated)
     np.testing.assert_array_equal(success, ~idle)
     assert 3 <= success.sum() <= 9
@@ -234,6 +236,7 @@ def test_training_and_judging_agree():
     scores = crane_trials.evaluate(policy, "ForestryCrane-v0", trials, seed, 1, **training)
     assert scores.pop("episodic_return") == pytest.approx(returns.mean())
     assert scores.pop("success_rate") == pytest.approx(success.mean())
+    assert scores.pop("gentle_rate") == pytest.approx(gentle.mean())
     expected = {f"success_rate_{d}m": success[diameters == d].mean() for d in crane_env.DIAMETERS}
     assert scores == pytest.approx(expected) and scores.keys() == expected.keys()
 
