@@ -252,7 +252,8 @@ reward/distance reward/grapple reward/lift reward/balance reward/ground
 termination/diverged termination/joint_limit termination/overspeed termination/log_too_far
 termination/not_reached termination/time_limit time/rollout time/update
 eval/episodic_return eval/success_rate eval/gentle_rate
-eval/success_rate_0.3m eval/success_rate_0.4m eval/success_rate_0.5m eval/success_rate_0.6m eval/success_rate_0.7m eval/success_rate_0.8m
+eval/success_rate_0.3m eval/success_rate_0.4m eval/success_rate_0.5m
+eval/success_rate_0.6m eval/success_rate_0.7m eval/success_rate_0.8m
 """.split()
 CLIPPED = ["losses/old_approx_kl", "losses/approx_kl", "losses/clipfrac"]
 OWN_KEYS = {
