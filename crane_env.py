@@ -110,7 +110,6 @@ TIMESTEP = 0.005  # s, one physics step (paper, Sec. V)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
 SDF_INITPOINTS, SDF_ITERATIONS = 8, 5  # of each search for SDF contacts (assets/README.md)
 LOG_LENGTH = 2.75  # m
-LOG_DENSITY = 650.0  # kg/m^3
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
 DIAMETERS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # m, of the paper's tables
 POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
@@ -351,7 +350,8 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
-    carried: Array | float = 0.0  # (N,) share of the log held up by the crane, which stands free
+    # (N,) share of the log's weight that is in the air, less what the crane puts on the ground
+    carried: Array | float = 0.0
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:

@@ -1,7 +1,7 @@
 """The real machine's drives: how oil moves the joints of the crane, as measured on it.
 
-A command passes a dead time, the lag of a valve, and a spring whose rest position moves at the
-commanded speed, the force of which is limited. Joints are damped. The pump gives only so much oil.
+A command passes a dead time, the lag of a valve, and a spring. The spring's rest position moves at
+the commanded speed, and its force is limited. Joints are damped. The pump's oil is limited.
 `crane_env` simulates this with actuators="hydraulic". Sources of all numbers: assets/README.md,
 "Drives".
 """
@@ -29,6 +29,7 @@ OIL = np.array(
     [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
      [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
+LOG_DENSITY = 650.0  # kg/m^3
 # What randomize=1 draws uniformly at each start: nominal, lowest and highest value.
 DRAWN = {
     "stiffness": (
@@ -47,7 +48,7 @@ DRAWN = {
         np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
         np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
     ),
-    "density": (650.0, 450.0, 950.0),  # kg/m^3
+    "density": (LOG_DENSITY, 450.0, 950.0),  # kg/m^3
     "friction": (1.0, 0.5, 1.5),  # factor on that of all surfaces
     "pose_error": (np.zeros(3), np.full(3, -0.057), np.full(3, 0.057)),  # m, 0.1 m at most
     "yaw_error": (0.0, -0.1745, 0.1745),  # rad

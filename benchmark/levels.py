@@ -66,7 +66,9 @@ def policy_of(method: str, level: str) -> tuple[Any, dict[str, Any]] | None:
     """A shipped policy and the task it was trained on, None if there is none."""
     if METHODS[method] is None:
         settings = {"ideal": IDEAL, "hydraulic": HYDRAULIC}  # a random machine is hydraulic too
-        return level in settings and (ScriptedCrane(settings=settings[level]), {"sensors": False})
+        if level not in settings:
+            return None
+        return ScriptedCrane(settings=settings[level]), {"sensors": False}
     path = POLICIES / f"{METHODS[method]}{'' if level == 'ideal' else f'_{level}'}.pt"
     return eval_crane.load_policy(path)[:2] if path.is_file() else None
 
@@ -138,7 +140,7 @@ def append(path: Path, jobs: list[dict], measure: Callable) -> None:
         if {key: str(value) for key, value in job.items()} in done:
             continue
         results = measure(job)
-        if not results:
+        if results is None:
             continue
         rows.append(job | {name: f"{value:.4g}" for name, value in results.items()})
         with eval_crane.whole_file(path) as part, open(part, "w", newline="") as file:
@@ -187,7 +189,7 @@ def main(
 
         def measure(job: dict) -> dict[str, float] | None:
             found = policy_of(job["method"], job["trained_on"])
-            return found and judge(*found, job["judged_on"], trials, seed)
+            return None if found is None else judge(*found, job["judged_on"], trials, seed)
 
         append(HERE / "levels.csv", jobs, measure)
     elif what == "sweeps":
@@ -201,7 +203,7 @@ def main(
         def measure(job: dict) -> dict[str, float] | None:
             found = policy_of(job["method"], "hydraulic")
             with changed(job["changed"], job["value"]):
-                return found and judge(*found, "hydraulic", trials, seed)
+                return None if found is None else judge(*found, "hydraulic", trials, seed)
 
         append(HERE / "robustness.csv", jobs, measure)
     else:

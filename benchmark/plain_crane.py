@@ -15,6 +15,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import crane_env
+import machine
 
 
 class PlainCrane(gymnasium.Env):
@@ -54,7 +55,7 @@ class PlainCrane(gymnasium.Env):
         model, data = self.model, self.data
         q, (x, y, yaw), diameter = crane_env.sample_start(self.np_random)
         radius, length = diameter / 2, crane_env.LOG_LENGTH
-        mass = crane_env.LOG_DENSITY * pi * radius**2 * length
+        mass = machine.LOG_DENSITY * pi * radius**2 * length
         across = mass * (3 * radius**2 + length**2) / 12
         cylinder, capsule = self.log_geoms
         model.geom_size[[cylinder, capsule], 0] = radius
