@@ -70,21 +70,9 @@ import ctypes.util
 import os
 import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from types import NoneType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    TypedDict,
-    Unpack,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, Unpack
 from weakref import WeakSet
 
 if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
@@ -99,376 +87,46 @@ from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch, SimulationError
 from numpy.random import Generator, SeedSequence, default_rng
 
-from machine import DRAWN, MAX_PRESSURE, VALVE_STEPS, Valves, install_drives, oil_per_movement
+import crane_task
+from crane_options import (
+    HYDRAULIC,
+    PAPER,
+    RANDOMIZED,
+    Options,
+    Range,
+    Size,
+    Threads,
+    check,
+    complete,
+)
+from crane_task import CONDITIONS, D_MAX, D_MIN, GENTLE_FORCE, LOG_LENGTH, TERMS, CraneState
+from machine import (
+    ACTUATED,
+    COMMAND_OF_SERVO,
+    DRAWN,
+    JOINTS,
+    MAX_PRESSURE,
+    PASSIVE,
+    SERVOS,
+    SPEEDS,
+    TIMESTEP,
+    VALVE_STEPS,
+    Valves,
+    load_model,
+    oil_per_movement,
+)
 
 # ---- constants
 
 HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
-MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 REVISION = 7  # of the task; raise it when a change makes trained policies worse
-TIMESTEP = 0.005  # s, one physics step (paper, Sec. V)
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
-SDF_INITPOINTS, SDF_ITERATIONS = 8, 5  # of each search for SDF contacts (assets/README.md)
-LOG_LENGTH = 2.75  # m
-D_MIN, D_MAX = 0.3, 0.8  # m, log diameter
-DIAMETERS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # m, of the paper's tables
-POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
-POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
-ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
-Q8_MAX = 3.0  # rad
 
-TIME_LIMIT = 9.0  # s, of an episode
-REACH_TIME = 6.0  # s, by which the log must have been reached
-REACH_DISTANCE = 0.35  # m, d_combine below which the log is reached
-LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre
-LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.005 rad or 0.012 m
-HOLD_TIME = 0.5  # s at the end of an episode in which the log must be held
-MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
-MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
-GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.5 kN
 
-OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
-DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give it
-GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed the jaws
-LIFT_WEIGHT = 2.0  # largest staged r_lift
-BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
-CLOSING_HEIGHT = 0.1  # m above Delta_p = 0: closing jaws pull the grapple down, onto the ground
-NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
-GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
-LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
-CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 30.0  # what r_ground takes away at GENTLE_FORCE, from nothing at half of it
-
-SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
-    "real": np.array(
-        [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
-    ),
-    "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
-}
-# The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
-JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
-SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
-COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
-ACTUATED = [0, 1, 2, 3, 6, 7]  # of our q1 ... q8
-PASSIVE = [4, 5]  # of our q1 ... q8
-LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
-
-TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]
-TERMINATIONS = ["diverged", "joint_limit", "overspeed", "log_too_far", "not_reached", "time_limit"]
-CONDITIONS = ["not_reached", "not_lifted", "not_held", "off_centre"]
 COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 CARE = ["gentle", *COSTS, "time_up", "log_speed"]
 Array = np.ndarray
 ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
-
-
-# ---- options
-
-
-class Range(NamedTuple):
-    """Lowest and highest value that a number of this `Annotated` type may have."""
-
-    low: float
-    high: float
-
-
-Size = Annotated[int, Range(1, 16_384)]
-Width = Annotated[int, Range(1, 4096)]
-Times = Annotated[int, Range(1, 1000)]
-Count = Annotated[int, Range(1, 10**10)]
-Threads = Annotated[int, Range(0, 256)]
-Seed = Annotated[int, Range(0, 2**32 - 1)]
-Share = Annotated[float, Range(0, 1)]
-Factor = Annotated[float, Range(0, 1_000_000)]
-Exponent = Annotated[float, Range(-20, 20)]
-
-
-def check(values: Mapping[str, Any], *annotated: Any) -> None:
-    """ValueError says which of the values its annotation does not allow, and what it allows.
-
-    annotated: classes or functions. Checked are bools, Literals and numbers with a Range, also in
-    a tuple or beside None.
-    """
-    annotations = {}
-    for each in annotated:
-        annotations |= get_type_hints(each, include_extras=True)
-    for name, value in values.items():
-        if name not in annotations:
-            known = ", ".join(each for each in annotations if each not in ("options", "return"))
-            raise ValueError(f"there is no option {name!r}, only {known}")
-        kind, items = annotations[name], [value]
-        if NoneType in get_args(kind):
-            kind, items = get_args(kind)[0], [] if value is None else [value]
-        if get_origin(kind) is tuple:
-            kind, items, name = get_args(kind)[0], value, f"each of {name}"
-        limits = getattr(kind, "__metadata__", [None])[0]
-        if isinstance(limits, Range):
-            (low, high), whole = limits, get_args(kind)[0] is int
-            types = (int, np.integer) if whole else (int, float, np.number)
-            good = all(isinstance(item, types) and low <= item <= high for item in items)
-            needed = f"a {'whole ' if whole else ''}number in [{low:,}, {high:,}]"
-        elif get_origin(kind) is Literal or kind is bool:
-            allowed = get_args(kind) or (False, True)
-            good = all(item in allowed for item in items)
-            needed = f"one of {', '.join(map(repr, allowed))}"
-        else:  # a path, a name
-            continue
-        if not good:
-            raise ValueError(f"{name} must be {needed}, got {value!r}")
-
-
-class Options(TypedDict, total=False):
-    """What can be changed about the task: keywords of `gymnasium.make`, `--env.*` of the scripts.
-
-    In parentheses: the default of ForestryCrane-v0.
-    """
-
-    frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (20)
-    actuators: Literal["ideal", "hydraulic"]  # servos, or the machine's own drives (ideal)
-    randomize: Share  # width of the random errors of drives, log and sensors (0.0)
-    sensors: bool  # also observe last command, rates of q5 and q6, oil forces (False)
-    contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
-    reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
-    speed: Literal["real", "mjcf"]  # joint speed limits (real)
-    offset: Literal["plus", "minus"]  # sign of the diameter's part in Delta_p,z (plus)
-    signed_yaw: bool  # observe the signed angle to the log, not the paper's Delta_psi (True)
-    axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
-    pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
-    difficulty: Share  # 0: easy starts, 1: the full task (1.0)
-    retry: Share  # share of episodes that start as a recent failure of that crane did (0.0)
-    integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
-    solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
-
-
-DEFAULTS = Options(
-    frame_skip=20, actuators="ideal", randomize=0.0, sensors=False, contact="primitive",
-    reward="staged", speed="real", offset="plus", signed_yaw=True, axes="crane",
-    pose_noise="none", difficulty=1.0, retry=0.0, integrator="implicitfast", solver="Newton",
-)  # fmt: skip
-PAPER = Options(  # ForestryCranePaper-v0
-    frame_skip=1, contact="sdf", reward="paper", offset="minus", signed_yaw=False, axes="world",
-    integrator="implicit", solver="CG",
-)  # fmt: skip
-HYDRAULIC = Options(actuators="hydraulic", sensors=True)  # ForestryCraneHydraulic-v0
-RANDOMIZED = Options(randomize=1.0, **HYDRAULIC)  # ForestryCraneRandomized-v0
-
-
-def complete(options: Options) -> Options:
-    """The options with all defaults filled in. ValueError names a wrong one and what is allowed."""
-    check(options, Options)
-    return {**DEFAULTS, **options}
-
-
-# ---- model
-
-
-def load_model(
-    contact: str = "primitive",
-    integrator: str = "implicitfast",
-    solver: str = "Newton",
-    actuators: str = "ideal",
-    visual: bool = True,
-) -> mujoco.MjModel:
-    """Compile assets/crane.xml.
-
-    actuators "ideal": PI velocity servos. "hydraulic": the drives identified on the machine.
-    contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
-    jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B).
-    visual False leaves out what is only drawn: the same motion, sooner.
-    """
-    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
-    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-    spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
-    spec.option.sdf_initpoints, spec.option.sdf_iterations = SDF_INITPOINTS, SDF_ITERATIONS
-    if contact == "sdf":
-        # Collision bits of crane.xml: 4 is the log's. 8 collides with nothing, but a geom without
-        # any bit counts as only drawn.
-        spec.geom("log").contype, spec.geom("log_capsule").contype = 4, 8
-        for geom in spec.geoms:
-            if geom.classname.name == "jaw_mesh":
-                geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_SDF, 4
-            elif geom.classname.name == "jaw_collision":
-                geom.conaffinity &= ~4
-    if actuators == "hydraulic":
-        install_drives(spec, SERVOS, COMMAND_OF_SERVO)
-    spec.compiler.discardvisual = not visual
-    return spec.compile()
-
-
-def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
-    """Distance of the tip joint from the slew axis and its height, both in m (DH parameters)."""
-    arm = 3.157 + 2 * q4
-    out = -0.18 + 3.49288 * np.cos(q2) - 0.3925 * np.cos(q2 + q3) + arm * np.sin(q2 + q3)
-    up = 3.5657 + 3.49288 * np.sin(q2) - 0.3925 * np.sin(q2 + q3) - arm * np.cos(q2 + q3)
-    return out, up
-
-
-def sample_start(rng: Generator) -> tuple[Array, Array, float]:
-    """Draw one start of the full task: q (8,), log pose (x, y, yaw) in m and rad, diameter in m."""
-    good = np.zeros(1, bool)
-    while not good.any():
-        q2, q3, q4 = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3)).T
-        out, up = tip_position(q2, q3, q4)
-        good = (4.5 <= out) & (out <= 8) & (2.7 <= up) & (up <= 4.2) & (q2 + q3 > 0.05)
-    q2, q3, q4 = np.stack([q2, q3, q4])[:, np.argmax(good)]
-    q1, azimuth = rng.uniform(-2 * np.pi / 3, -np.pi / 3, size=2)
-    swing5, swing6 = rng.uniform(-0.05, 0.05, size=2)
-    q7, yaw = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
-    q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
-    q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
-    return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
-
-
-def ease_start(
-    q: Array, log_pose: Array, diameter: float, difficulty: float
-) -> tuple[Array, Array, float]:
-    """A start of `sample_start` with its log moved towards an easy place, which difficulty 0 has.
-
-    The easy place is a point under the grapple, with the grapple's yaw and the mean diameter.
-    """
-    q1, q7, (x, y, yaw) = q[0], q[6], log_pose
-    out, _ = tip_position(*q[1:4])
-    easiest = np.array([np.clip(out, 5.5, 7.5), q1, q1 - q7, (D_MIN + D_MAX) / 2])
-    way = np.array([np.hypot(x, y), np.arctan2(y, x), yaw, diameter]) - easiest
-    way[2] = (way[2] + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
-    radius, azimuth, yaw, diameter = easiest + difficulty * way
-    yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
-    return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
-
-
-# ---- observation, reward and rules of N cranes, without the simulator
-
-
-class CraneState(NamedTuple):
-    """What observation, reward and rules are computed from, for N cranes."""
-
-    q: Array  # (N, 8) joint positions, rad and m
-    dq: Array  # (N, 6) velocities of the actuated joints
-    grapple_centre: Array  # (N, 3) p_C, m
-    grapple_axis: Array  # (N, 3) e_C,x, unit
-    log_centre: Array  # (N, 3) p_l, m
-    log_axis: Array  # (N, 3) along the log, unit
-    touching: Array  # (N, 2) bool, outer and inner jaw on the log
-    diameter: Array  # (N,) m
-    # (N,) share of the log's weight that is in the air, less what the crane puts on the ground
-    carried: Array | float = 0.0
-
-
-def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
-    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
-
-    Paper: Eqs. (relative distance) and (angle distance). offset "plus" adds d_off = (d_max - d) / 2
-    of the log's diameter d, "minus" subtracts it. The signed angle turns the grapple's axis into
-    the log's. A log looks the same after half a turn, so this is the shorter turn, or the longer
-    one where the shorter would take the rotator beyond ROTATOR_MAX.
-    """
-    delta_p = state.log_centre - state.grapple_centre
-    delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
-    (grapple_x, grapple_y, _), (log_x, log_y, _) = state.grapple_axis.T, state.log_axis.T
-    shadow = np.maximum(np.sqrt(log_x**2 + log_y**2), 1e-9)  # its length on the ground
-    log_x, log_y = log_x / shadow, log_y / shadow
-    dot = grapple_x * log_x + grapple_y * log_y
-    cross = grapple_x * log_y - grapple_y * log_x
-    signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
-    slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
-    slew = (slew + np.pi) % (2 * np.pi) - np.pi
-    # q7 once the crane faces the log and the grapple is aligned; a hanging grapple's yaw is q1 - q7
-    rotator = state.q[:, 6] + slew - signed_angle
-    signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > ROTATOR_MAX)
-    return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
-
-
-def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
-    """Pose measurement errors of Sec. V-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
-    decay = np.sum(delta_p**2, axis=-1, keepdims=True) / POSE_RANGE**2  # s(Delta_p)
-    factor = 1 + epsilon * decay
-    return delta_p * factor[:, :1], angle * factor[:, 1]
-
-
-def log_clearance(state: CraneState) -> Array:
-    """Height of the lowest point of the log above the ground, (N,) in m."""
-    up = np.minimum(np.abs(state.log_axis[:, 2]), 1.0)
-    below_centre = LOG_LENGTH / 2 * up + state.diameter / 2 * np.sqrt(1 - up**2)
-    return state.log_centre[:, 2] - below_centre
-
-
-def centre_miss(state: CraneState) -> Array:
-    """Distance from the log's centre to p_C, measured along the log, (N,) in m."""
-    return np.abs(np.sum((state.grapple_centre - state.log_centre) * state.log_axis, axis=-1))
-
-
-def reward_terms(
-    state: CraneState,
-    distance: Array,
-    clearance: Array,
-    miss: Array,
-    command: Array,
-    ground: Array,
-    difficulty: float = 1.0,
-    kind: str = "staged",
-) -> Array:
-    """The TERMS of the reward, which is their sum, (5, N).
-
-    distance (N,) in m is d_combine = ||Delta_p|| + 1 m Delta_psi, for "staged" with a Delta_p that
-    is 0 CLOSING_HEIGHT higher. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
-    command (N, 6) the commanded velocities in rad/s and m/s, ground (N,) the decision's largest
-    force of crane on ground in N.
-
-    kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
-    the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
-    r_ground punishes hitting the ground. An easy task forgives it: a crane that does not lift yet
-    would learn to stay away.
-    """
-    r_ground = np.zeros_like(distance)
-    r_distance = np.exp(-OMEGA2 * distance)
-    closed = state.q[:, 7] / Q8_MAX
-    if kind == "paper":
-        r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
-        height_error = np.abs(state.log_centre[:, 2] - DESIRED_HEIGHT)
-        r_lift = (1 - np.tanh(height_error)) * (1 - r_grapple)
-        r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
-    else:
-        near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
-        r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
-        clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
-        height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
-        calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
-        held = state.touching.all(axis=-1)
-        centred = np.exp(-((miss / LIFT_MISS) ** 2))
-        lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
-        r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
-        hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, 1)
-        r_ground = -GROUND_WEIGHT * difficulty**2 * hardness
-    return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
-
-
-def termination_rule(
-    state: CraneState, time: Array, reached: Array, diverged: Array, limits: Array, speed: Array
-) -> Array:
-    """The first of TERMINATIONS that ends each episode, "none" where it goes on, (N,).
-
-    time (N,) in s since the start, reached (N,) bool, limits (8, 2) of the joints and speed (2, 6),
-    as in SPEEDS, in rad, m and s.
-    """
-    q, (low, high) = state.q[:, LIMITED], limits[LIMITED].T
-    beyond = (q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE)
-    rules = [  # in the order of TERMINATIONS
-        diverged,
-        beyond.any(axis=-1),
-        ((state.dq < 2 * speed[0]) | (state.dq > 2 * speed[1])).any(axis=-1),
-        np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1) > LOG_RANGE,
-        ~reached & (time > REACH_TIME - 1e-9),
-        time > TIME_LIMIT - 1e-9,
-    ]
-    return np.select(rules, TERMINATIONS, default="none")
-
-
-def grip_conditions(clearance: Array, touching: Array, miss: Array) -> Array:
-    """Whether the log is now lifted, held by both jaws, and held near its centre: (3, N) bool.
-
-    clearance and miss (N,) in m, touching (N, 2) bool, as in `info` and `CraneState`.
-    """
-    return np.array([clearance >= MIN_CLEARANCE, touching.all(axis=-1), miss <= MAX_MISS])
 
 
 # ---- environments
@@ -539,8 +197,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.speed, self.frame_skip = SPEEDS[options["speed"]], int(options["frame_skip"])
         self.difficulty = options["difficulty"]
         self.dt = self.frame_skip * TIMESTEP  # s, one decision
-        self.max_decisions = int(np.ceil(TIME_LIMIT / self.dt - 1e-9))
-        self.hold_decisions = int(np.floor(HOLD_TIME / self.dt + 1e-9)) + 1  # with both its ends
+        self.max_decisions = int(np.ceil(crane_task.TIME_LIMIT / self.dt - 1e-9))
+        # with both its ends
+        self.hold_decisions = int(np.floor(crane_task.HOLD_TIME / self.dt + 1e-9)) + 1
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
         self.metadata["autoreset_mode"] = self.autoreset_mode
 
@@ -661,15 +320,17 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         state, time = self.state(), self.decisions * self.dt
         obs, info = self.observe(state, command)
-        near = (info["d_combine"] < REACH_DISTANCE) & (time < REACH_TIME + 1e-9)
+        in_time = time < crane_task.REACH_TIME + 1e-9
+        near = (info["d_combine"] < crane_task.REACH_DISTANCE) & in_time
         self.reach_time = np.minimum(self.reach_time, np.where(near, time, np.inf))
         reached = np.isfinite(self.reach_time)
-        gripped = grip_conditions(info["clearance"], state.touching, info["centre_miss"])
+        gripped = crane_task.grip_conditions(info["clearance"], state.touching, info["centre_miss"])
         self.streaks = (self.streaks + 1) * gripped
         safe = (self.streaks >= self.hold_decisions).all(axis=0)
         self.time_up = np.where(safe, np.minimum(self.time_up, time), np.inf)
 
-        ending = termination_rule(state, time, reached, diverged, self.joint_range, self.speed)
+        limits = self.joint_range, self.speed
+        ending = crane_task.termination_rule(state, time, reached, diverged, *limits)
         ending[self.resting] = "none"
         truncated = ending == "time_limit"
         terminated = (ending != "none") & ~truncated
@@ -758,15 +419,19 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             if retry and failures and start_rng.random() < retry:
                 self.starts[i] = failures[start_rng.integers(len(failures))]
             else:
-                self.starts[i] = sample_start(start_rng)
-            self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
+                self.starts[i] = crane_task.sample_start(start_rng)
+            bound = crane_task.POSE_NOISE
+            self.noise[i] = noise_rng.uniform(-bound, bound, self.noise[i].shape)
             if share := self.options["randomize"]:
                 for name, (nominal, low, high) in DRAWN.items():
-                    drawn = machine_rng.uniform(low, high)
+                    if name in ("stiffness", "damping"):
+                        drawn = np.exp(machine_rng.uniform(np.log(low), np.log(high)))
+                    else:
+                        drawn = machine_rng.uniform(low, high)
                     self.drawn[name][i] = nominal + share * (drawn - nominal)
         starts = [self.starts[i] for i in ids]
         if self.difficulty < 1:
-            starts = [ease_start(*start, self.difficulty) for start in starts]
+            starts = [crane_task.ease_start(*start, self.difficulty) for start in starts]
         q, log_pose, diameter = (np.array(part) for part in zip(*starts))
         q[:, 4:6] += self.drawn["swing"][ids]
         if self.fixed_diameter is not None:
@@ -838,14 +503,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
         """Observations (N, 18 or 32), float32, inside their space; what `info` says of them."""
-        delta_p, delta_psi, signed_angle = relative_pose(state, self.options["offset"])
+        delta_p, delta_psi, signed_angle = crane_task.relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
-        clearance, miss = log_clearance(state), centre_miss(state)
+        clearance, miss = crane_task.log_clearance(state), crane_task.centre_miss(state)
         kind = self.options["reward"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
-        above = 0.0 if kind == "paper" else CLOSING_HEIGHT
+        above = 0.0 if kind == "paper" else crane_task.CLOSING_HEIGHT
         distance = np.linalg.norm(delta_p + [0, 0, above], axis=-1) + delta_psi
-        terms = reward_terms(
+        terms = crane_task.reward_terms(
             state, distance, clearance, miss, command, self.hit, self.difficulty, kind
         )
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
@@ -858,7 +523,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             angle = np.clip(delta_psi + change, 0, 1)
         if self.options["pose_noise"] != "none":
             now = np.minimum(self.decisions, self.noise.shape[1] - 1)
-            delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
+            epsilon = self.noise[np.arange(len(now)), now]
+            delta_p, angle = crane_task.noisy_pose(delta_p, angle, epsilon)
         if self.options["axes"] == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T

@@ -22,7 +22,8 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from numpy import ndarray as Array
 from numpy.random import SeedSequence
 
-from crane_env import CARE, CONDITIONS, DIAMETERS, TERMINATIONS, TERMS, CraneVectorEnv
+from crane_env import CARE, CraneVectorEnv
+from crane_task import CONDITIONS, DIAMETERS, TERMINATIONS, TERMS
 
 RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
 RESULTS |= {*CONDITIONS, *CARE}

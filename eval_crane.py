@@ -30,20 +30,16 @@ import tyro
 from tqdm import tqdm
 
 import crane_env
+import crane_options
+import crane_task
 import crane_trials
+import machine
 import mppo_beta_crane
 import ppo_crane
 import recurrent_ppo_crane
 import trpo_crane
-from crane_env import (
-    CONDITIONS,
-    D_MAX,
-    D_MIN,
-    DIAMETERS,
-    Range,
-    Seed,
-    Threads,
-)
+from crane_options import Range, Seed, Threads
+from crane_task import CONDITIONS, D_MAX, D_MIN, DIAMETERS
 from crane_trials import make_envs, monte_carlo_trials, run_trials
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
@@ -96,7 +92,7 @@ class Args:
     """show one trial after another in a window instead of judging"""
 
     def __post_init__(self) -> None:
-        crane_env.check(vars(self), Args)
+        crane_options.check(vars(self), Args)
 
 
 def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
@@ -117,7 +113,7 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
     if "frame_skip" not in task:
         raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
-    task = crane_env.DEFAULTS | task  # older files do not know all options
+    task = crane_options.DEFAULTS | task  # older files do not know all options
     if task["revision"] != crane_env.REVISION:
         print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
     script = ALGORITHMS[algorithm]
@@ -151,7 +147,7 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
         raise SystemExit(f"--env-id {env_id}: {error}") from None
     if not on_crane:
         raise SystemExit(f"--env-id {env_id} is not the crane")
-    names = trained_on.keys() & crane_env.DEFAULTS.keys() - {"difficulty", "retry"}
+    names = trained_on.keys() & crane_options.DEFAULTS.keys() - {"difficulty", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
     if args.policy == "file":
         options["sensors"] = trained_on["sensors"]  # what its networks read
@@ -294,11 +290,11 @@ def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
     substeps = 2 if skip % 20 == 0 else 1
     scene["frame_skip"] = skip // substeps
     frame_every = max(1, round(10 / scene["frame_skip"]))
-    fps = round(1 / (frame_every * scene["frame_skip"] * crane_env.TIMESTEP))
+    fps = round(1 / (frame_every * scene["frame_skip"] * machine.TIMESTEP))
     gif = args.video.suffix.lower() == ".gif"
     how = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
-    frames = round(crane_env.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
+    frames = round(crane_task.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
     bar, mean = tqdm(total=frames, unit="frame", leave=False), not args.stochastic
     with whole_file(args.video) as path, bar, imageio.get_writer(path, **how) as video:
         for diameter, seed in zip(diameters, seeds):

@@ -1,20 +1,36 @@
-"""The real machine's drives: how oil moves the joints of the crane, as measured on it.
+"""The machine: the crane's model for the simulator, and the real drives as measured on it.
 
-A command passes a dead time, the lag of a valve, and a spring. The spring's rest position moves at
-the commanded speed, and its force is limited. Joints are damped. The pump's oil is limited.
-`crane_env` simulates this with actuators="hydraulic". Sources of all numbers: assets/README.md,
-"Drives".
+The drives turn oil into motion. A command passes a dead time, the lag of a valve, and a spring. The
+spring's rest position moves at the commanded speed, and its force is limited. Joints are damped.
+The pump's oil is limited.
+`crane_env` simulates this with actuators="hydraulic". Sources of all numbers: assets/README.md.
 """
 
-from collections.abc import Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy import ndarray as Array
 
+MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
+TIMESTEP = 0.005  # s, one physics step (paper, Sec. V)
+SDF_INITPOINTS, SDF_ITERATIONS = 8, 5  # of each search for SDF contacts (assets/README.md)
+SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telescope stage m/s
+    "real": np.array(
+        [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
+    ),
+    "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
+}
+# The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
+JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
+SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
+COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
+ACTUATED = [0, 1, 2, 3, 6, 7]  # of our q1 ... q8
+PASSIVE = [4, 5]  # of our q1 ... q8
+
 # Six numbers belong to q1, q2, q3, each telescope stage, q7 and q8.
-STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 1.23e4])  # N m/rad, N/m
-DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 757.0])  # N m s/rad, N s/m
+STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 2.5e4])  # N m/rad, N/m
+DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 3.4e3])  # N m s/rad, N s/m
 LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.130])  # s, of the valve, first order
 DEAD_TIME = np.array([0.117, 0.080, 0.044, 0.060, 0.058, 0.058])  # s
 BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
@@ -30,17 +46,18 @@ OIL = np.array(
      [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
 LOG_DENSITY = 650.0  # kg/m^3
-# What randomize=1 draws uniformly at each start: nominal, lowest and highest value.
+# What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
+# damping are wide, so their logarithms are uniform. All else is uniform.
 DRAWN = {
     "stiffness": (
         STIFFNESS,
-        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 2.55e3]),
-        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 1.24e4]),
+        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4]),
+        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),
     ),
     "damping": (
         DAMPING,
-        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 62.9]),
-        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 1596.0]),
+        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 2.7e3]),
+        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 4.3e3]),
     ),
     "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
     "gain": (  # factor on the speed, in the negative and the positive direction
@@ -57,12 +74,42 @@ DRAWN = {
 }
 
 
-def install_drives(spec: mujoco.MjSpec, joints: Sequence[int], commands: Sequence[int]) -> None:
-    """Turn the servos of assets/crane.xml into drives.
+def load_model(
+    contact: str = "primitive",
+    integrator: str = "implicitfast",
+    solver: str = "Newton",
+    actuators: str = "ideal",
+    visual: bool = True,
+) -> mujoco.MjModel:
+    """Compile assets/crane.xml.
 
-    joints are the indices of the driven joints, commands says which of the six commands each obeys.
+    actuators "ideal": PI velocity servos. "hydraulic": the drives identified on the machine.
+    contact "primitive": capsule chains for the jaws against a capsule for the log. "sdf": the
+    jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B).
+    visual False leaves out what is only drawn: the same motion, sooner.
     """
-    for index, command in zip(joints, commands):
+    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
+    spec.option.sdf_initpoints, spec.option.sdf_iterations = SDF_INITPOINTS, SDF_ITERATIONS
+    if contact == "sdf":
+        # Collision bits of crane.xml: 4 is the log's. 8 collides with nothing, but a geom without
+        # any bit counts as only drawn.
+        spec.geom("log").contype, spec.geom("log_capsule").contype = 4, 8
+        for geom in spec.geoms:
+            if geom.classname.name == "jaw_mesh":
+                geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_SDF, 4
+            elif geom.classname.name == "jaw_collision":
+                geom.conaffinity &= ~4
+    if actuators == "hydraulic":
+        install_drives(spec)
+    spec.compiler.discardvisual = not visual
+    return spec.compile()
+
+
+def install_drives(spec: mujoco.MjSpec) -> None:
+    """Turn the servos of assets/crane.xml into drives."""
+    for index, command in zip(SERVOS, COMMAND_OF_SERVO):
         joint = spec.joints[index]
         joint.damping[0] = DAMPING[command]
         spec.actuator(joint.name).gainprm[0] = spec.actuator(joint.name).biasprm[2] = 0

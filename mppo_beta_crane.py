@@ -44,8 +44,9 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import crane_env
+import crane_options
 import crane_trials
-from crane_env import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
+from crane_options import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
 
 ALGORITHM = "mppo_beta"
 A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is infinite at 0 and 1
@@ -69,7 +70,7 @@ class Args:
     # task
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
-    env: crane_env.Options = field(default_factory=lambda: {"retry": 0.25})
+    env: crane_options.Options = field(default_factory=lambda: {"retry": 0.25})
     """options of the crane; in parentheses: what ForestryCrane-v0 has"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
@@ -100,7 +101,7 @@ class Args:
     eval_seed: Seed = 10_000  # seed of all trials
 
     def __post_init__(self) -> None:
-        crane_env.check(vars(self), Args)
+        crane_options.check(vars(self), Args)
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -212,7 +213,7 @@ def load_checkpoint(folder: Path) -> tuple[dict, Args]:
         if not {"weights", "optimizer", "iteration"} <= checkpoint.keys():
             raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since
-        options = {name: task[name] for name in crane_env.DEFAULTS if name in task}
+        options = {name: task[name] for name in crane_options.DEFAULTS if name in task}
         options = checkpoint["args"]["env"] | options
         saved = Args(**checkpoint["args"] | {"env": options})
     except Exception:  # a damaged file raises many kinds

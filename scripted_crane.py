@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane_env import SPEEDS
+from machine import SPEEDS
 
 DH = (  # a [m], d [m], alpha [rad] of q1, q2, q3, q4 stage 1, q4 stage 2, q5, q6, q7
     (-0.18, 2.425, np.pi / 2),

@@ -34,10 +34,10 @@ import numpy as np
 import torch
 import tyro
 
-import crane_env
+import crane_options
 import crane_trials
 import eval_crane
-from crane_env import Seed
+from crane_options import Seed
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "compare_sb3.csv"
@@ -85,7 +85,7 @@ class Args:
     """CSV file that gets a row from each run"""
 
     def __post_init__(self) -> None:
-        crane_env.check(vars(self), Args)
+        crane_options.check(vars(self), Args)
 
 
 def judge(task: str, policy: Any) -> tuple[float, float]:

@@ -32,10 +32,12 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_env
+import crane_options
 import crane_trials
 import eval_crane
 import machine
-from crane_env import CraneVectorEnv, Range, Seed
+from crane_env import CraneVectorEnv
+from crane_options import Range, Seed
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 HERE = Path(__file__).parent
@@ -176,7 +178,7 @@ def main(
     seed: Seed = 40_000,
 ) -> None:
     """trials: per log diameter; seed: of the trials."""
-    crane_env.check({"trials": trials, "seed": seed}, main)
+    crane_options.check({"trials": trials, "seed": seed}, main)
     torch.set_num_threads(1)
     protocol = {"per_diameter": trials, "seed": seed}
     if what == "table":

@@ -27,9 +27,9 @@ import tyro
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.wrappers import TransformObservation
 
-import crane_env
+import crane_options
 import crane_trials
-from crane_env import Count, Seed
+from crane_options import Count, Seed
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "masked_pendulum.csv"
@@ -59,7 +59,7 @@ class Args:
     seeds: tuple[Seed, ...] = (1, 2, 3)  # one run each of either script
 
     def __post_init__(self) -> None:
-        crane_env.check(vars(self), Args)
+        crane_options.check(vars(self), Args)
 
 
 def train(algorithm: str, seed: int, steps: int) -> list[tuple[int, float]]:

@@ -15,6 +15,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import crane_env
+import crane_options
+import crane_task
 import machine
 
 
@@ -28,19 +30,19 @@ class PlainCrane(gymnasium.Env):
     def __init__(self, frame_skip: int = 20):
         self.model = model = crane_env.load_model(visual=False)
         self.data = data = mujoco.MjData(model)
-        self.frame_skip, self.dt = frame_skip, frame_skip * crane_env.TIMESTEP
+        self.frame_skip, self.dt = frame_skip, frame_skip * machine.TIMESTEP
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
         self.sensordata, self.warnings = data.sensordata, data.warning
-        self.q_at = crane_env.JOINTS
-        self.dq_at = [crane_env.JOINTS[i] for i in crane_env.ACTUATED]
+        self.q_at = machine.JOINTS
+        self.dq_at = [machine.JOINTS[i] for i in machine.ACTUATED]
         _, integrators = np.split(model.actuator_gainprm, 2)  # after the velocity actuators
         self.kp = integrators[:, 0]
-        self.lead = model.jnt_actfrcrange[crane_env.SERVOS, 1] / self.kp
-        self.servos = list(zip(crane_env.SERVOS, self.lead.tolist()))
-        joint_range = model.jnt_range[crane_env.JOINTS]
-        tolerance = crane_env.LIMIT_TOLERANCE * np.array([-1, 1])
-        self.limits = (joint_range[crane_env.LIMITED] + tolerance).tolist()
-        self.speeds = crane_env.SPEEDS["real"].T.tolist()  # lowest and highest of each joint
+        self.lead = model.jnt_actfrcrange[machine.SERVOS, 1] / self.kp
+        self.servos = list(zip(machine.SERVOS, self.lead.tolist()))
+        joint_range = model.jnt_range[machine.JOINTS]
+        tolerance = crane_task.LIMIT_TOLERANCE * np.array([-1, 1])
+        self.limits = (joint_range[crane_task.LIMITED] + tolerance).tolist()
+        self.speeds = machine.SPEEDS["real"].T.tolist()  # lowest and highest of each joint
         self.log_q = model.joint("log").qposadr[0]
         self.log_body = model.body("log").id
         self.log_geoms = [model.geom("log").id, model.geom("log_capsule").id]
@@ -53,8 +55,8 @@ class PlainCrane(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
         super().reset(seed=seed)
         model, data = self.model, self.data
-        q, (x, y, yaw), diameter = crane_env.sample_start(self.np_random)
-        radius, length = diameter / 2, crane_env.LOG_LENGTH
+        q, (x, y, yaw), diameter = crane_task.sample_start(self.np_random)
+        radius, length = diameter / 2, crane_task.LOG_LENGTH
         mass = machine.LOG_DENSITY * pi * radius**2 * length
         across = mass * (3 * radius**2 + length**2) / 12
         cylinder, capsule = self.log_geoms
@@ -67,10 +69,10 @@ class PlainCrane(gymnasium.Env):
         c, s = cos(yaw / 2) / sqrt(2), sin(yaw / 2) / sqrt(2)
         self.qpos[self.log_q : self.log_q + 7] = x, y, radius, c, -c, -s, s
         self.qpos[self.q_at] = q
-        self.qpos[crane_env.SERVOS] = q[crane_env.ACTUATED][crane_env.COMMAND_OF_SERVO]
+        self.qpos[machine.SERVOS] = q[machine.ACTUATED][machine.COMMAND_OF_SERVO]
         mujoco.mj_step1(model, data)
-        load = data.qfrc_bias[crane_env.SERVOS]
-        self.act[:] = self.qpos[crane_env.SERVOS] + load / self.kp
+        load = data.qfrc_bias[machine.SERVOS]
+        self.act[:] = self.qpos[machine.SERVOS] + load / self.kp
         self.diameter, self.decisions, self.reached = float(diameter), 0, False
         return self._observe([0.0] * 6)[0], {}
 
@@ -92,16 +94,16 @@ class PlainCrane(gymnasium.Env):
         now = self.decisions * self.dt
 
         obs, reward, d_combine, distance, q, dq = self._observe(command)
-        if d_combine < crane_env.REACH_DISTANCE and now < crane_env.REACH_TIME + 1e-9:
+        if d_combine < crane_task.REACH_DISTANCE and now < crane_task.REACH_TIME + 1e-9:
             self.reached = True
         diverged = bool(self.warnings.number.any())
         terminated = (
             diverged
             or not self._within_limits(q, dq)
-            or distance > crane_env.LOG_RANGE
-            or (not self.reached and now > crane_env.REACH_TIME - 1e-9)
+            or distance > crane_task.LOG_RANGE
+            or (not self.reached and now > crane_task.REACH_TIME - 1e-9)
         )
-        truncated = not terminated and now > crane_env.TIME_LIMIT - 1e-9
+        truncated = not terminated and now > crane_task.TIME_LIMIT - 1e-9
         return obs, 0.0 if diverged else reward, terminated, truncated, {}
 
     def _command(self, action: np.ndarray) -> list[float]:
@@ -109,7 +111,7 @@ class PlainCrane(gymnasium.Env):
         for a, (low, high) in zip(action.tolist(), self.speeds):
             a = min(max(a, -1.0), 1.0)
             command.append(a * high if a >= 0 else -a * low)
-        self.ctrl[:] = 2 * [command[i] for i in crane_env.COMMAND_OF_SERVO]
+        self.ctrl[:] = 2 * [command[i] for i in machine.COMMAND_OF_SERVO]
         return command
 
     def _clamp(self) -> None:
@@ -136,23 +138,23 @@ class PlainCrane(gymnasium.Env):
         dot, cross = (ax * ux + ay * uy) / level, (ax * uy - ay * ux) / level
         angle = (atan2(cross, dot) + pi / 2) % pi - pi / 2
         rotator = q[6] + (atan2(ly, lx) - q[0] + pi) % (2 * pi) - pi - angle
-        if abs(rotator) > crane_env.ROTATOR_MAX:
+        if abs(rotator) > crane_task.ROTATOR_MAX:
             angle += copysign(pi, rotator)
-        z += (crane_env.D_MAX - self.diameter) / 2
+        z += (crane_task.D_MAX - self.diameter) / 2
         d_combine = sqrt(x * x + y * y + z * z) + 1.0 - min(abs(dot), 1.0)
 
         up = min(abs(uz), 1.0)
-        clearance = lz - crane_env.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        beyond = crane_env.NEAR_SHARPNESS * (d_combine - crane_env.REACH_DISTANCE)
-        grasp = min(1.0, exp(-beyond)) * exp(-((miss / crane_env.GRAPPLE_MISS) ** 2))
+        clearance = lz - crane_task.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
+        beyond = crane_task.NEAR_SHARPNESS * (d_combine - crane_task.REACH_DISTANCE)
+        grasp = min(1.0, exp(-beyond)) * exp(-((miss / crane_task.GRAPPLE_MISS) ** 2))
         clearance = max(clearance, 1e-9)
         height = sqrt(min(clearance, 1 / clearance))
-        lift = exp(-((miss / crane_env.LIFT_MISS) ** 2)) * height
-        reward = exp(-crane_env.OMEGA2 * d_combine) + crane_env.LIFT_WEIGHT * lift
-        reward += crane_env.GRAPPLE_WEIGHT * grasp * q[7] / crane_env.Q8_MAX
+        lift = exp(-((miss / crane_task.LIFT_MISS) ** 2)) * height
+        reward = exp(-crane_task.OMEGA2 * d_combine) + crane_task.LIFT_WEIGHT * lift
+        reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if touch[0] > 0 and touch[1] > 0:
             calm = 1 - tanh(hypot(*command[:5]))
-            reward += crane_env.BALANCE_WEIGHT * calm * lift
+            reward += crane_task.BALANCE_WEIGHT * calm * lift
         cos_q1, sin_q1 = cos(q[0]), sin(q[0])
         x, y = cos_q1 * x + sin_q1 * y, cos_q1 * y - sin_q1 * x
         return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
@@ -168,16 +170,16 @@ class NumpyCrane(PlainCrane):
     def _command(self, action: np.ndarray) -> np.ndarray:
         action = np.clip(action, -1.0, 1.0)
         command = np.where(action < 0, -action * self.speeds[0], action * self.speeds[1])
-        self.ctrl[:] = np.tile(command[crane_env.COMMAND_OF_SERVO], 2)
+        self.ctrl[:] = np.tile(command[machine.COMMAND_OF_SERVO], 2)
         return command
 
     def _clamp(self) -> None:
-        position = self.qpos[crane_env.SERVOS]
+        position = self.qpos[machine.SERVOS]
         self.act[:] = np.clip(self.act, position - self.lead, position + self.lead)
 
     def _within_limits(self, q: np.ndarray, dq: np.ndarray) -> bool:
         low, high = self.limits
-        q = q[crane_env.LIMITED]
+        q = q[crane_task.LIMITED]
         slow = np.all((2 * self.speeds[0] <= dq) & (dq <= 2 * self.speeds[1]))
         return bool(slow and np.all((low <= q) & (q <= high)))
 
@@ -191,23 +193,23 @@ class NumpyCrane(PlainCrane):
         angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
         slew = (np.arctan2(log_centre[1], log_centre[0]) - q[0] + np.pi) % (2 * np.pi) - np.pi
         rotator = q[6] + slew - angle
-        if np.abs(rotator) > crane_env.ROTATOR_MAX:
+        if np.abs(rotator) > crane_task.ROTATOR_MAX:
             angle += np.pi * np.sign(rotator)
-        delta_p[2] += (crane_env.D_MAX - self.diameter) / 2
+        delta_p[2] += (crane_task.D_MAX - self.diameter) / 2
         d_combine = np.linalg.norm(delta_p) + 1.0 - np.minimum(np.abs(dot), 1.0)
 
         up = np.minimum(np.abs(log_axis[2]), 1.0)
-        below = crane_env.LOG_LENGTH / 2 * up + self.diameter / 2 * np.sqrt(1 - up**2)
+        below = crane_task.LOG_LENGTH / 2 * up + self.diameter / 2 * np.sqrt(1 - up**2)
         clearance = np.maximum(log_centre[2] - below, 1e-9)
-        beyond = crane_env.NEAR_SHARPNESS * (d_combine - crane_env.REACH_DISTANCE)
-        grasp = np.minimum(1.0, np.exp(-beyond)) * np.exp(-((miss / crane_env.GRAPPLE_MISS) ** 2))
+        beyond = crane_task.NEAR_SHARPNESS * (d_combine - crane_task.REACH_DISTANCE)
+        grasp = np.minimum(1.0, np.exp(-beyond)) * np.exp(-((miss / crane_task.GRAPPLE_MISS) ** 2))
         height = np.sqrt(np.minimum(clearance, 1 / clearance))
-        lift = np.exp(-((miss / crane_env.LIFT_MISS) ** 2)) * height
-        reward = np.exp(-crane_env.OMEGA2 * d_combine) + crane_env.LIFT_WEIGHT * lift
-        reward += crane_env.GRAPPLE_WEIGHT * grasp * q[7] / crane_env.Q8_MAX
+        lift = np.exp(-((miss / crane_task.LIFT_MISS) ** 2)) * height
+        reward = np.exp(-crane_task.OMEGA2 * d_combine) + crane_task.LIFT_WEIGHT * lift
+        reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if np.all(self.sensordata[12:14] > 0):
             calm = 1 - np.tanh(np.linalg.norm(command[:5]))
-            reward += crane_env.BALANCE_WEIGHT * calm * lift
+            reward += crane_task.BALANCE_WEIGHT * calm * lift
         c, s = np.cos(q[0]), np.sin(q[0])
         along = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ delta_p
         obs = np.concatenate([q, dq, along, [angle]]).astype(np.float32)
@@ -215,7 +217,7 @@ class NumpyCrane(PlainCrane):
 
 
 def disagreement(
-    make: type[PlainCrane], policy: Any, options: crane_env.Options, frame_skip: int
+    make: type[PlainCrane], policy: Any, options: crane_options.Options, frame_skip: int
 ) -> tuple[float, float]:
     """Largest difference of an observation and of a reward between `make` and CraneVectorEnv.
 

@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 from test_hydraulics import AXES, LABS_FIT, MEASURED, TIMES, response
 
-import crane_env
 import crane_trials
+import machine
 
 FIGURE = Path(__file__).parent.parent / "assets" / "figures" / "drives.svg"
 
@@ -30,7 +30,7 @@ def main() -> None:
     for axis, panel in zip(AXES, panels):
         curve, measured = response(axis, 0.4), np.array(MEASURED[axis])
         instants = TIMES[: len(measured)]
-        seconds = crane_env.TIMESTEP * np.arange(1, len(curve) + 1)
+        seconds = machine.TIMESTEP * np.arange(1, len(curve) + 1)
         worst = np.abs(np.interp(instants, seconds, curve) - measured).max()
         panel.axhline(1, color="0.8", linewidth=1)
         panel.plot(seconds, curve, label="this model")

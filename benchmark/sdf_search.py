@@ -30,7 +30,8 @@ from tyro.conf import Positional
 import crane_env
 import crane_trials
 import eval_crane
-from crane_env import MAX_MISS, MIN_CLEARANCE
+import machine
+from crane_task import MAX_MISS, MIN_CLEARANCE
 
 RESULTS = Path(__file__).parent / "sdf_search.csv"
 SETTINGS = [(40, 10), (16, 5), (8, 5), (4, 5)]
@@ -64,7 +65,7 @@ def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
     rows, reference = [], None
     for initpoints, iterations in SETTINGS:
         # `load_model` reads these constants
-        crane_env.SDF_INITPOINTS, crane_env.SDF_ITERATIONS = initpoints, iterations
+        machine.SDF_INITPOINTS, machine.SDF_ITERATIONS = initpoints, iterations
         start = time.perf_counter()
         envs = crane_trials.make_envs(env_id, len(seeds), diameter=diameters, **options)
         results = crane_trials.run_trials(policy, envs, seeds)

@@ -33,6 +33,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_env
+import crane_options
 import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv
@@ -168,7 +169,7 @@ def nan_saved(folder: Path) -> bool:
 
 def flags(args: Any) -> list[str]:
     names = [name for name in vars(args) if name != "env"]
-    names += [f"env.{name}" for name in crane_env.DEFAULTS] if hasattr(args, "env") else []
+    names += [f"env.{name}" for name in crane_options.DEFAULTS] if hasattr(args, "env") else []
     return ["--" + name.replace("_", "-") for name in names if name != "path"]
 
 

@@ -55,7 +55,7 @@ from plain_crane import NumpyCrane, PlainCrane, disagreement
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
-import crane_env
+import crane_task
 import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv
@@ -146,7 +146,7 @@ def record(policy: Any, options: dict, decisions: int) -> list[Sample]:
         done = terminated | truncated
         for i in np.flatnonzero(~done):  # the controls of an ended episode are gone
             model, state, touching = before[i]
-            lifted = touching.all() and info["clearance"][i] > crane_env.MIN_CLEARANCE
+            lifted = touching.all() and info["clearance"][i] > crane_task.MIN_CLEARANCE
             kind = "held log" if lifted else "" if touching.any() else "free motion"
             ctrl = envs.batch.get_data(i, data).ctrl.copy()
             samples[i].append(Sample(model, state, ctrl, kind))

@@ -129,7 +129,7 @@ MUTATIONS = [
     ),
     Mutation(
         "an easy task punishes as the full one",
-        ("crane_env.py",),
+        ("crane_task.py",),
         "-GROUND_WEIGHT * difficulty**2 *",
         "-GROUND_WEIGHT *",
         "test_rules -k ground",
@@ -151,8 +151,8 @@ MUTATIONS = [
     Mutation(
         "a log reached after 6 s counts",
         ("crane_env.py",),
-        "& (time < REACH_TIME + 1e-9)",
-        "",
+        "< crane_task.REACH_DISTANCE) & in_time",
+        "< crane_task.REACH_DISTANCE)",
         "test_rules",
     ),
     Mutation(
@@ -199,7 +199,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a number's range is not checked",
-        ("crane_env.py",),
+        ("crane_options.py",),
         "isinstance(item, types) and low <= item <= high for item in items",
         "isinstance(item, types) for item in items",
         "test_failures -k range",
@@ -248,7 +248,7 @@ MUTATIONS = [
     ),
     Mutation(
         "one jaw is enough to carry",
-        ("crane_env.py",),
+        ("crane_task.py",),
         "CARRY_WEIGHT * centred * held * state.carried",
         "CARRY_WEIGHT * centred * state.carried",
         "test_rules -k carrying",

@@ -17,9 +17,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, NormalizeObservation, NormalizeReward
 
 import crane_env
+import crane_options
+import crane_task
 import crane_trials
 import eval_crane
-from crane_env import DEFAULTS, CraneEnv, CraneVectorEnv, Options
+import machine
+from crane_env import CraneEnv, CraneVectorEnv
+from crane_options import DEFAULTS, Options
 
 NAMES = ["q1", "q2", "q3", "q4", "q5", "q6", "q7", "q8"]
 
@@ -71,12 +75,12 @@ def test_the_papers_task_is_as_printed():
     }
     obs, info = env.reset(seed=0)
     state, command = env.envs.state(), np.zeros((1, 6))
-    delta_p, delta_psi, _ = crane_env.relative_pose(state, "minus")
+    delta_p, delta_psi, _ = crane_task.relative_pose(state, "minus")
     np.testing.assert_allclose(obs[14:], [*delta_p[0], delta_psi[0]], rtol=1e-6)
     d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
-    measured = crane_env.log_clearance(state), crane_env.centre_miss(state)
-    terms = crane_env.reward_terms(state, d_combine, *measured, command, np.zeros(1), kind="paper")
-    np.testing.assert_allclose([info[term] for term in crane_env.TERMS], terms[:, 0])
+    measured = crane_task.log_clearance(state), crane_task.centre_miss(state)
+    terms = crane_task.reward_terms(state, d_combine, *measured, command, np.zeros(1), kind="paper")
+    np.testing.assert_allclose([info[term] for term in crane_task.TERMS], terms[:, 0])
     assert env.envs.dt == 0.005
     model = env.envs.batch.get_model(0)
     assert (model.geom_type == mujoco.mjtGeom.mjGEOM_SDF).any()
@@ -98,15 +102,15 @@ def test_options_say_their_defaults():
 def test_columns_are_the_engines():
     """JOINTS and SERVOS are columns of qpos and of qvel; every servo has two actuators."""
     model = crane_env.load_model()
-    assert [model.joint(i).name for i in crane_env.JOINTS] == NAMES
+    assert [model.joint(i).name for i in machine.JOINTS] == NAMES
     servos = "q1 q2 q3 q4 q4_stage2 q7 q8 q8_inner".split()
-    assert [model.joint(i).name for i in crane_env.SERVOS] == servos
+    assert [model.joint(i).name for i in machine.SERVOS] == servos
     for columns in (model.jnt_qposadr, model.jnt_dofadr):
         np.testing.assert_array_equal(columns[:10], np.arange(10))
     moved = model.actuator_trnid[:, 0]
-    np.testing.assert_array_equal(moved, crane_env.SERVOS * 2)
-    actuated = [NAMES[i] for i in crane_env.ACTUATED]
-    commanded = [actuated[i] for i in crane_env.COMMAND_OF_SERVO]
+    np.testing.assert_array_equal(moved, machine.SERVOS * 2)
+    actuated = [NAMES[i] for i in machine.ACTUATED]
+    commanded = [actuated[i] for i in machine.COMMAND_OF_SERVO]
     assert commanded == [name.split("_")[0] for name in servos]
 
 
@@ -131,12 +135,12 @@ def test_observation_table_matches_the_space():
     short = CraneVectorEnv(1).single_observation_space
     assert short == gymnasium.spaces.Box(space.low[:18], space.high[:18])
     assert [r[0].split()[0] for r in table[:8]] == NAMES
-    assert [r[0].split()[0] for r in table[8:14]] == [NAMES[i] for i in crane_env.ACTUATED]
+    assert [r[0].split()[0] for r in table[8:14]] == [NAMES[i] for i in machine.ACTUATED]
     commands = [r[0].split(",")[0] for r in table[18:24]]
-    assert commands == [f"last command of {NAMES[i]}" for i in crane_env.ACTUATED]
+    assert commands == [f"last command of {NAMES[i]}" for i in machine.ACTUATED]
     assert [r[0] for r in table[24:26]] == ["q5 velocity", "q6 velocity"]
     forces = [r[0].split(",")[0] for r in table[26:]]
-    assert forces == [f"force of the oil on {NAMES[i]}" for i in crane_env.ACTUATED]
+    assert forces == [f"force of the oil on {NAMES[i]}" for i in machine.ACTUATED]
 
 
 def test_action_table_matches_the_space_and_speeds():
@@ -146,7 +150,7 @@ def test_action_table_matches_the_space_and_speeds():
     np.testing.assert_allclose([float(r[3]) for r in table], space.high)
     for column, speed in ((4, "real"), (5, "mjcf")):
         documented = [re.findall(r"-?\d+\.?\d*", r[column])[:2] for r in table]
-        np.testing.assert_allclose(np.array(documented, float).T, crane_env.SPEEDS[speed])
+        np.testing.assert_allclose(np.array(documented, float).T, machine.SPEEDS[speed])
 
 
 @pytest.mark.parametrize("signed_yaw", [True, False])
@@ -160,7 +164,7 @@ def test_observation_holds_what_the_table_says(signed_yaw):
         np.testing.assert_allclose(obs[:, k], envs.batch.joint(name).qpos[:, 0], atol=1e-6)
     for k, name in enumerate(["q1", "q2", "q3", "q4", "q7", "q8"]):
         np.testing.assert_allclose(obs[:, 8 + k], envs.batch.joint(name).qvel[:, 0], atol=1e-5)
-    delta_p, delta_psi, signed_angle = crane_env.relative_pose(state)
+    delta_p, delta_psi, signed_angle = crane_task.relative_pose(state)
     np.testing.assert_allclose(obs[:, 14:17], delta_p, atol=1e-5)
     assert np.abs(signed_angle - delta_psi).min() > 1e-3
     expected = signed_angle if signed_yaw else delta_psi
@@ -197,7 +201,7 @@ def test_observations_stay_in_the_space():
 
 
 def test_a_crane_is_the_same_for_any_number_of_cranes_and_threads(monkeypatch):
-    monkeypatch.setattr(crane_env, "REACH_TIME", 2.0)
+    monkeypatch.setattr(crane_task, "REACH_TIME", 2.0)
 
     def episode(n, threads):
         envs = CraneVectorEnv(n, env_threads=threads, pose_noise="step")
@@ -274,7 +278,7 @@ def test_integrators_are_clamped_within_25_ms_from_the_start(frame_skip, period)
     for k in range(13):
         if k == 3:
             envs.start_episodes(np.array([1]))  # perhaps between two clamps of the other
-        before = envs.qpos[:, crane_env.SERVOS] + 2 * envs.max_lead
+        before = envs.qpos[:, machine.SERVOS] + 2 * envs.max_lead
         envs.act[:] = before
         envs.advance(np.zeros((2, 6)))
         clamped.append((envs.act != before).all(axis=1))
@@ -320,7 +324,7 @@ def test_start_distribution():
     """Ranges and uniformity as fixed for the task."""
     rng = np.random.default_rng(0)
     n = 4000
-    starts = [crane_env.sample_start(rng) for _ in range(n)]
+    starts = [crane_task.sample_start(rng) for _ in range(n)]
     q = np.array([s[0] for s in starts])
     log = np.array([s[1] for s in starts])
     diameter = np.array([s[2] for s in starts])
@@ -343,7 +347,7 @@ def test_start_distribution():
         assert kolmogorov < 1.63 / np.sqrt(n), name  # the 1 % point
     for values, low, high in [(q[:, 1], 0.1, 1.0), (q[:, 2], -0.6, 0.8), (q[:, 3], 0.05, 1.0)]:
         assert low <= values.min() and high - 0.1 < values.max() <= high
-    out, up = crane_env.tip_position(*q[:, 1:4].T)
+    out, up = crane_task.tip_position(*q[:, 1:4].T)
     assert (4.5 <= out).all() and (out <= 8).all() and (2.7 <= up).all() and (up <= 4.2).all()
     assert (q[:, 1] + q[:, 2] > 0.05).all()
     azimuth = np.arctan2(log[:, 1], log[:, 0])
@@ -357,7 +361,7 @@ def test_the_world_starts_as_sampled():
     envs = CraneVectorEnv(6)
     envs.reset(seed=11)
     for i, seed in enumerate(np.random.SeedSequence(11).spawn(6)):
-        q, (x, y, yaw), diameter = crane_env.sample_start(np.random.default_rng(seed))
+        q, (x, y, yaw), diameter = crane_task.sample_start(np.random.default_rng(seed))
         state = envs.state()
         np.testing.assert_allclose(state.q[i], q)
         np.testing.assert_allclose(state.log_centre[i], [x, y, diameter / 2], atol=1e-12)
@@ -383,7 +387,7 @@ def test_pose_noise_is_kept_or_redrawn():
         factors = []
         for _ in range(4):
             obs, *_ = envs.advance(np.zeros((1, 6)))
-            delta_p, _, angle = crane_env.relative_pose(envs.state())
+            delta_p, _, angle = crane_task.relative_pose(envs.state())
             decay = (delta_p**2).sum() / 64
             away = np.linalg.norm(obs[0, 14:16]) / np.linalg.norm(delta_p[0, :2])
             changes = np.array([away, obs[0, 16] / delta_p[0, 2], obs[0, 17] / angle[0]]) - 1
@@ -397,7 +401,7 @@ def test_pose_noise_is_kept_or_redrawn():
 
 def test_retry_starts_failures_again(monkeypatch):
     """Every episode fails here; after a crane's first start none, half or all are repeats."""
-    monkeypatch.setattr(crane_env, "REACH_TIME", 0.8)
+    monkeypatch.setattr(crane_task, "REACH_TIME", 0.8)
     for retry, low, high in [(0.0, 0, 0), (0.5, 0.35, 0.65), (1.0, 1, 1)]:
         envs = CraneVectorEnv(32, retry=retry)
         obs, _ = envs.reset(seed=0)
@@ -428,8 +432,8 @@ def test_retry_leaves_successes_alone(monkeypatch):
     env = CraneEnv(retry=1.0)
     env.reset(seed=1)
     with monkeypatch.context() as patch:
-        patch.setattr(crane_env, "REACH_DISTANCE", 100.0)
-        patch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 1), bool))
+        patch.setattr(crane_task, "REACH_DISTANCE", 100.0)
+        patch.setattr(crane_task, "grip_conditions", lambda *_: np.ones((3, 1), bool))
         assert len(starts(env, 3)) == 3
     assert len(starts(env, 3)) == 1
 
@@ -438,19 +442,19 @@ def test_difficulty():
     envs = CraneVectorEnv(64, difficulty=0.0)
     envs.reset(seed=0)
     state = envs.state()
-    delta_p, delta_psi, _ = crane_env.relative_pose(state)
+    delta_p, delta_psi, _ = crane_task.relative_pose(state)
     assert delta_psi.max() < 1e-2  # aligned but for the swing
     easy = np.linalg.norm(delta_p[:, :2], axis=-1)
     np.testing.assert_allclose(state.diameter, 0.55)
     envs.difficulty = 1.0
     envs.reset(seed=0)
-    delta_p, _, _ = crane_env.relative_pose(envs.state())
+    delta_p, _, _ = crane_task.relative_pose(envs.state())
     assert easy.max() < 1.2 and np.linalg.norm(delta_p[:, :2], axis=-1).max() > 3
-    start = crane_env.sample_start(np.random.default_rng(9))
-    full = crane_env.ease_start(*start, 1.0)
+    start = crane_task.sample_start(np.random.default_rng(9))
+    full = crane_task.ease_start(*start, 1.0)
     for eased, drawn in zip(full, start):
         np.testing.assert_allclose(eased, drawn, atol=1e-12)
-    np.testing.assert_array_equal(crane_env.ease_start(*start, 0.3)[0], start[0])
+    np.testing.assert_array_equal(crane_task.ease_start(*start, 0.3)[0], start[0])
 
 
 def test_a_repeated_start_has_the_difficulty_of_now():
@@ -461,7 +465,7 @@ def test_a_repeated_start_has_the_difficulty_of_now():
     ways = []
     for envs.difficulty in (0.0, 1.0):
         envs.start_episodes(np.arange(8))
-        ways.append(np.linalg.norm(crane_env.relative_pose(envs.state())[0][:, :2], axis=-1))
+        ways.append(np.linalg.norm(crane_task.relative_pose(envs.state())[0][:, :2], axis=-1))
     assert ways[0].max() < 1.2 and ways[1].mean() > 1.5
 
 
@@ -494,12 +498,12 @@ def test_action_is_a_fraction_of_the_speed_limit():
     envs = CraneVectorEnv(2)
     envs.reset(seed=0)
     envs.advance(np.array([[-0.5] * 6, [0.5] * 6]))
-    low, high = crane_env.SPEEDS["real"]
-    expected = np.stack([0.5 * low, 0.5 * high])[:, crane_env.COMMAND_OF_SERVO]
+    low, high = machine.SPEEDS["real"]
+    expected = np.stack([0.5 * low, 0.5 * high])[:, machine.COMMAND_OF_SERVO]
     np.testing.assert_allclose(envs.ctrl[:, :8], expected)
     np.testing.assert_allclose(envs.ctrl[:, 8:], expected)
     envs.advance(np.full((2, 6), 7.0))  # beyond the box: clipped
-    np.testing.assert_allclose(envs.ctrl[0], [*high[crane_env.COMMAND_OF_SERVO]] * 2)
+    np.testing.assert_allclose(envs.ctrl[0], [*high[machine.COMMAND_OF_SERVO]] * 2)
 
 
 @pytest.mark.parametrize(
@@ -546,11 +550,11 @@ def test_bad_arguments(kwargs, words):
 
 def test_complete_fills_in_the_defaults_and_leaves_its_argument_alone():
     given = {"retry": 0.5, "frame_skip": 1800}
-    assert crane_env.complete(given) == {**DEFAULTS, "retry": 0.5, "frame_skip": 1800}
+    assert crane_options.complete(given) == {**DEFAULTS, "retry": 0.5, "frame_skip": 1800}
     assert given == {"retry": 0.5, "frame_skip": 1800}
-    assert crane_env.complete({}) == DEFAULTS and crane_env.complete({}) is not DEFAULTS
+    assert crane_options.complete({}) == DEFAULTS and crane_options.complete({}) is not DEFAULTS
     with pytest.raises(ValueError, match=r"number in \[1, 1,800\], got 1801"):
-        crane_env.complete({"frame_skip": 1801})
+        crane_options.complete({"frame_skip": 1801})
 
 
 def test_bad_calls():
@@ -611,13 +615,13 @@ def test_spec_knows_the_length_of_an_episode():
 
 def test_info_has_masks_and_what_sb3_reads(monkeypatch):
     """Gymnasium's own conversion to one dictionary a crane finds what it looks for."""
-    monkeypatch.setattr(crane_env, "REACH_TIME", 0.5)
+    monkeypatch.setattr(crane_task, "REACH_TIME", 0.5)
     envs = DictInfoToList(CraneVectorEnv(3))
     _, infos = envs.reset(seed=0)
-    names = {"d_combine", "clearance", "centre_miss", *crane_env.TERMS}
+    names = {"d_combine", "clearance", "centre_miss", *crane_task.TERMS}
     assert all(set(info) == names for info in infos)
     envs.env.reach_time[1] = 0.1
-    of_ends = {"success", "is_success", *crane_env.CONDITIONS}
+    of_ends = {"success", "is_success", *crane_task.CONDITIONS}
     for _ in range(5):
         _, _, terminated, _, infos = envs.step(np.zeros((3, 6)))
     assert terminated.tolist() == [True, False, True]
@@ -721,7 +725,7 @@ def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
     assert info["termination"].tolist() == ["none", "diverged", "none"]
     assert terminated.tolist() == [False, True, False] and reward[1] == 0
     assert np.isfinite(obs).all() and np.isfinite(info["final_obs"][1]).all()
-    assert all(np.isfinite(info[term]).all() for term in crane_env.TERMS)  # reports take the mean
+    assert all(np.isfinite(info[term]).all() for term in crane_task.TERMS)  # reports take the mean
     _, _, terminated, _, info = envs.step(np.zeros((3, 6)))
     assert not terminated.any() and set(info["termination"]) == {"none"}
     state = envs.state()

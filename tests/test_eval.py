@@ -16,6 +16,8 @@ import pytest
 import torch
 
 import crane_env
+import crane_options
+import crane_task
 import crane_trials
 import eval_crane
 from eval_crane import Args, FixedPolicy, judge
@@ -131,8 +133,8 @@ def test_shipped_policies_are_of_this_revision(algorithm, capsys):
     assert task["revision"] == crane_env.REVISION and capsys.readouterr().err == ""
     # what a policy is trained on is what is registered, but for its training's own options
     own = {"difficulty", "retry"}
-    trained = {name: task[name] for name in crane_env.DEFAULTS.keys() - own}
-    assert trained.items() <= crane_env.DEFAULTS.items()
+    trained = {name: task[name] for name in crane_options.DEFAULTS.keys() - own}
+    assert trained.items() <= crane_options.DEFAULTS.items()
 
 
 @pytest.mark.slow
@@ -175,10 +177,10 @@ def options_of(*, policy="file", trained_on=None, **args):
 
 def test_task_to_judge_on(capsys):
     other = {"offset": "minus", "axes": "world", "signed_yaw": False, "frame_skip": 10}
-    trained_on = {"env_id": MINE, "revision": 6, **crane_env.complete(other)}
+    trained_on = {"env_id": MINE, "revision": 6, **crane_options.complete(other)}
     trained_on |= {"difficulty": 0.0, "retry": 0.25}
     own = ("difficulty", "retry")  # of the training alone
-    options = {name: trained_on[name] for name in crane_env.DEFAULTS if name not in own}
+    options = {name: trained_on[name] for name in crane_options.DEFAULTS if name not in own}
     assert options_of(trained_on=trained_on) == (MINE, options)
     changed = (MINE, options | {"contact": "sdf"})
     assert options_of(trained_on=trained_on, contact="sdf") == changed
@@ -282,7 +284,7 @@ def test_acts_as_the_agent_of_any_algorithm(tmp_path, script):
     with torch.no_grad():
         agent.actor[-1].weight.mul_(100)
     weights = {k: v for k, v in agent.state_dict().items() if not k.startswith("critic.")}
-    task = {"env_id": CRANE, "revision": crane_env.REVISION, **crane_env.DEFAULTS}
+    task = {"env_id": CRANE, "revision": crane_env.REVISION, **crane_options.DEFAULTS}
     policy = {"algorithm": script.ALGORITHM, "args": asdict(args), "weights": weights}
     torch.save(policy | {"task": task}, tmp_path / "policy.pt")
     loaded, trained_on, name = eval_crane.load_policy(tmp_path)  # the run's folder or the file
@@ -332,7 +334,7 @@ def test_video(tmp_path, run_here, monkeypatch, kind):
         mujoco.Renderer(crane_env.load_model(), 8, 8).close()
     except Exception as error:
         pytest.skip(f"no OpenGL here: {error}")
-    monkeypatch.setattr(crane_env, "REACH_TIME", 0.8)  # an idle crane fails then
+    monkeypatch.setattr(crane_task, "REACH_TIME", 0.8)  # an idle crane fails then
     film = tmp_path / f"film.{kind}"
     line = ("--policy", "zero", "--diameters", "0.5", "0.7", "--video", film, "--width", "128")
     assert f"2 trials filmed in {film}" in run_here(*line).out

@@ -18,9 +18,10 @@ from filelock import FileLock
 from script_runs import ALGORITHMS, command, environment, module, only_run, run, scalars, small
 
 import crane_env
+import crane_options
 import crane_trials
 import eval_crane
-from crane_env import Range
+from crane_options import Range
 
 ECHO = "--env-id recall_env:Echo-v0 --env.retry 0".split()  # a quick task
 
@@ -42,13 +43,13 @@ def test_check_reads_annotations():
     bad |= {"sizes": [(1, 0), (2.5,)], "colour": ["green", None], "shade": ["red"], "switch": [3]}
     for name, values in good.items():
         for value in values:
-            crane_env.check({name: value}, Kinds)
+            crane_options.check({name: value}, Kinds)
     for name, values in bad.items():
         for value in values:
             with pytest.raises(ValueError, match=f"{name} must be .*got {re.escape(repr(value))}"):
-                crane_env.check({name: value}, Kinds)
+                crane_options.check({name: value}, Kinds)
     with pytest.raises(ValueError, match="no option 'size', only .*whole"):
-        crane_env.check({"size": 3}, Kinds)
+        crane_options.check({"size": 3}, Kinds)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -258,7 +259,7 @@ class Harmful:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_no_code_of_a_checkpoint_runs(tmp_path, run_here, algorithm):
-    task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_env.DEFAULTS}
+    task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_options.DEFAULTS}
     saved = {"algorithm": algorithm, "task": task, "args": vars(module(algorithm).Args())}
     saved |= {"weights": Harmful(), "optimizer": {}, "iteration": 1}
     torch.save(saved, tmp_path / "checkpoint.pt")
@@ -342,7 +343,7 @@ def test_options_of_the_crane_stay_as_they_were(tmp_path, run_here, monkeypatch)
     """Also those whose default has changed since."""
     arguments = [*small("ppo"), "--total-timesteps", "64", "--eval-every", "0"]
     run_here("ppo", *arguments, "--env.frame-skip", "4")
-    monkeypatch.setitem(crane_env.DEFAULTS, "reward", "paper")
+    monkeypatch.setitem(crane_options.DEFAULTS, "reward", "paper")
     left = run_here("ppo", "--resume", only_run(tmp_path), "--total-timesteps", "128")
     assert left["envs"].unwrapped.options["reward"] == "staged"
     with pytest.raises(SystemExit, match="--resume: this run has frame_skip 4; leave"):

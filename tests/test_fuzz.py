@@ -9,10 +9,12 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import crane_env
-from crane_env import CraneVectorEnv, Options
+import crane_options
+import crane_task
+from crane_env import CraneVectorEnv
+from crane_options import Options
 
-ENDINGS = {"none", *crane_env.TERMINATIONS}
+ENDINGS = {"none", *crane_task.TERMINATIONS}
 
 
 def choices(name):
@@ -61,7 +63,7 @@ def run(cranes, decisions, seed, chosen):
         assert np.isfinite(reward).all() and not (terminated & truncated).any()
         assert set(info["termination"]) <= ENDINGS - {"diverged"}
         assert ((info["termination"] != "none") == (terminated | truncated)).all()
-        for term in ("d_combine", "clearance", "centre_miss", *crane_env.TERMS):
+        for term in ("d_combine", "clearance", "centre_miss", *crane_task.TERMS):
             assert np.isfinite(info[term]).all()
         assert not (info["success"] & ~truncated).any()
         ends += (terminated | truncated).sum()
@@ -93,17 +95,17 @@ junk = st.one_of(
 
 
 @settings(max_examples=300, deadline=None, derandomize=True, database=None)
-@given(st.sampled_from([*crane_env.DEFAULTS, "num_envs", "width", "camera", "diameter"]), junk)
+@given(st.sampled_from([*crane_options.DEFAULTS, "num_envs", "width", "camera", "diameter"]), junk)
 def test_an_option_is_accepted_or_refused_by_name(name, value):
     """Nothing between: no other error, and no crane with a value that its type does not allow."""
     if name == "num_envs" and isinstance(value, int) and value > 64:
-        value += crane_env.Size.__metadata__[0].high  # a thousand cranes would take long
+        value += crane_options.Size.__metadata__[0].high  # a thousand cranes would take long
     try:
         envs = gymnasium.make_vec("ForestryCrane-v0", **{"num_envs": 1, name: value})
     except ValueError as error:
         assert name in str(error)
     else:
-        crane_env.complete(envs.unwrapped.options)
+        crane_options.complete(envs.unwrapped.options)
         assert obs_is_fine(envs)
 
 

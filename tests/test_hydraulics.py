@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-import crane_env
+import crane_task
 import machine
-from crane_env import ACTUATED, JOINTS, CraneVectorEnv
-from machine import Valves
+from crane_env import CraneVectorEnv
+from machine import ACTUATED, JOINTS, Valves
 
 # Geryyy/crane_model, test/step_response_fixture.json: (speed - before) / (settled - before) after
 # a step of the velocity command at 0, mean over the edges of a recording
@@ -89,7 +89,7 @@ def response(axis, action):
 def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis, action):
     """Closer at every listed instant than the identified model of the lab that measured it."""
     measured = np.array(MEASURED[axis])
-    steps = np.round(TIMES[: len(measured)] / crane_env.TIMESTEP).astype(int) - 1
+    steps = np.round(TIMES[: len(measured)] / machine.TIMESTEP).astype(int) - 1
     worst = np.abs(response(axis, action)[steps] - measured).max()
     assert worst < LABS_FIT[axis]
 
@@ -129,7 +129,7 @@ def test_nothing_moves_within_the_dead_time():
     for k in range(1, 40):
         envs.advance(np.full((1, 6), 0.5))
         servos = np.abs(envs.act[0] - before)[[0, 1, 2, 3, 5, 6]] > 1e-9
-        moved = np.where((moved == 0) & servos, k * crane_env.TIMESTEP, moved)
+        moved = np.where((moved == 0) & servos, k * machine.TIMESTEP, moved)
     late = np.array(machine.DEAD_TIME)
     late[3] += machine.BREAKAWAY
     assert (moved > late).all() and (moved <= late + 0.03).all()
@@ -204,7 +204,7 @@ def test_passive_joints_and_force_limits_are_the_machines():
         dof = model.joint(name).dofadr[0]
         assert model.dof_damping[dof] == damping and model.dof_frictionloss[dof] == friction
     limits = [3.181e4, 2e5, 1e5, 5e4, 5e4, 2.2e3, 1.2e4, 1.2e4]
-    np.testing.assert_allclose(model.jnt_actfrcrange[crane_env.SERVOS, 1], limits)
+    np.testing.assert_allclose(model.jnt_actfrcrange[machine.SERVOS, 1], limits)
     assert (model.actuator_gainprm[:8, 0] == 0).all()  # no velocity servo is left
 
 
@@ -245,10 +245,10 @@ def test_the_observed_forces_are_those_of_the_engine(options):
 def test_an_idle_hydraulic_crane_stays():
     """It neither sags nor drifts in ten seconds, at the starts of the task."""
     envs = hydraulic(16)
-    before = envs.qpos[:, crane_env.SERVOS].copy()
+    before = envs.qpos[:, machine.SERVOS].copy()
     for _ in range(100):
         envs.advance(np.zeros((16, 6)))
-    assert np.abs(envs.qpos[:, crane_env.SERVOS] - before).max() < 0.02
+    assert np.abs(envs.qpos[:, machine.SERVOS] - before).max() < 0.02
 
 
 @pytest.mark.slow
@@ -274,7 +274,7 @@ def test_force_on_the_ground_is_that_of_the_contacts():
         model, data = envs.batch.get_model(0), envs.batch.get_data(0)
         _, _, _, _, info = envs.advance(np.array([[0, -0.5, 0, 0, 0, 0]]))
         data.ctrl[:] = envs.ctrl[0]
-        data.act[:] = envs.act[0] - crane_env.TIMESTEP * envs.ctrl[0, 8:]
+        data.act[:] = envs.act[0] - machine.TIMESTEP * envs.ctrl[0, 8:]
         mujoco.mj_forward(model, data)  # what the step began with
         total, force = np.zeros(3), np.zeros(6)
         ground, log = model.geom("ground").id, model.body("log").id
@@ -287,7 +287,7 @@ def test_force_on_the_ground_is_that_of_the_contacts():
     assert max(forces) > 10e3
     assert info["ground_peak"][0] == pytest.approx(max(forces), rel=0.02)
     assert info["ground_impulse"][0] == pytest.approx(0.005 * np.sum(forces), rel=0.02)
-    above = 0.005 * np.sum(np.array(forces) > crane_env.GENTLE_FORCE)
+    above = 0.005 * np.sum(np.array(forces) > crane_task.GENTLE_FORCE)
     assert info["ground_time"][0] == pytest.approx(above, abs=0.02)
 
 
@@ -334,10 +334,10 @@ def test_work_of_lifting_is_the_gained_energy():
 
 
 def test_costs_start_anew_with_an_episode_and_gentle_needs_both(monkeypatch):
-    monkeypatch.setattr(crane_env, "TIME_LIMIT", 0.3)
-    monkeypatch.setattr(crane_env, "REACH_DISTANCE", 100.0)
-    monkeypatch.setattr(crane_env, "HOLD_TIME", 0.1)
-    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 2), bool))
+    monkeypatch.setattr(crane_task, "TIME_LIMIT", 0.3)
+    monkeypatch.setattr(crane_task, "REACH_DISTANCE", 100.0)
+    monkeypatch.setattr(crane_task, "HOLD_TIME", 0.1)
+    monkeypatch.setattr(crane_task, "grip_conditions", lambda *_: np.ones((3, 2), bool))
     envs = CraneVectorEnv(2)
     envs.reset(seed=0)
     for _ in range(3):
@@ -352,19 +352,23 @@ def test_costs_start_anew_with_an_episode_and_gentle_needs_both(monkeypatch):
 
 
 def test_randomize_draws_from_the_bands():
-    """Uniformly, anew at each start, scaled by the share; and says in info what it drew."""
+    """Anew at each start, scaled by the share; and says in info what it drew."""
     for share in (1.0, 0.25):
         envs = hydraulic(256, randomize=share)
         _, info = envs.reset(seed=1)
         for name, (nominal, low, high) in machine.DRAWN.items():
             drawn = info[f"drawn_{name}"]
-            low, high = (nominal + share * (bound - nominal) for bound in (low, high))
+            if name in ("stiffness", "damping"):  # their logarithms are uniform
+                drawn = np.log(nominal + (drawn - nominal) / share)
+                low, high = np.log(low), np.log(high)
+            else:
+                low, high = (nominal + share * (bound - nominal) for bound in (low, high))
             assert (drawn >= low - 1e-9).all() and (drawn <= high + 1e-9).all(), name
             wide = high > low
             middle, width = (low + high) / 2, high - low
             spread = np.abs(drawn.mean(axis=0) - middle) / np.where(wide, width, 1)
             assert (spread[np.broadcast_to(wide, spread.shape)] < 0.09).all(), name  # 5 sigma
-            assert np.array_equal(drawn, envs.drawn[name])
+            assert np.array_equal(info[f"drawn_{name}"], envs.drawn[name])
         again = envs.reset()[1]
         assert np.abs(again["drawn_density"] - info["drawn_density"]).max() > 1
         assert np.array_equal(
@@ -376,26 +380,26 @@ def test_randomize_draws_from_the_bands():
 def test_what_is_drawn_reaches_the_engine():
     envs = hydraulic(8, randomize=1.0)
     _, info = envs.reset(seed=2)
-    servos = crane_env.COMMAND_OF_SERVO
+    servos = machine.COMMAND_OF_SERVO
     for i in range(8):
         model = envs.batch.get_model(i)
         np.testing.assert_allclose(
             model.actuator_gainprm[8:, 0], info["drawn_stiffness"][i, servos]
         )
         np.testing.assert_allclose(model.actuator_biasprm[8:, 1], -model.actuator_gainprm[8:, 0])
-        damping = model.dof_damping[crane_env.SERVOS]
+        damping = model.dof_damping[machine.SERVOS]
         np.testing.assert_allclose(damping, info["drawn_damping"][i, servos])
         late = model.actuator_delay[8:] - machine.DEAD_TIME[servos]
         np.testing.assert_allclose(late, info["drawn_late"][i], atol=1e-9)
-        assert (model.actuator_delay[8:] <= machine.MAX_DELAY * crane_env.TIMESTEP).all()
-        assert (model.actuator_delay[8:] >= crane_env.TIMESTEP).all()
+        assert (model.actuator_delay[8:] <= machine.MAX_DELAY * machine.TIMESTEP).all()
+        assert (model.actuator_delay[8:] >= machine.TIMESTEP).all()
         radius = envs.state().diameter[i] / 2
-        density = model.body("log").mass[0] / (np.pi * radius**2 * crane_env.LOG_LENGTH)
+        density = model.body("log").mass[0] / (np.pi * radius**2 * crane_task.LOG_LENGTH)
         assert density == pytest.approx(info["drawn_density"][i])
         factor = model.geom_friction / envs.model.geom_friction
         np.testing.assert_allclose(factor, info["drawn_friction"][i])
         lead = envs.max_lead[i] * model.actuator_gainprm[8:, 0]
-        np.testing.assert_allclose(lead, model.jnt_actfrcrange[crane_env.SERVOS, 1])
+        np.testing.assert_allclose(lead, model.jnt_actfrcrange[machine.SERVOS, 1])
     assert np.abs(envs.qvel).max() == 0
 
 
@@ -410,14 +414,14 @@ def test_what_is_drawn_reaches_the_observation_and_not_the_reward():
     swing = random.state().q[:, swung] - plain.state().q[:, swung]
     np.testing.assert_allclose(swing, info["drawn_swing"], atol=1e-6)
     assert np.abs(errors).max() > 1e-3 and not info["drawn_joint_error"][:, 3].any()
-    delta_p, _, angle = crane_env.relative_pose(random.state())
+    delta_p, _, angle = crane_task.relative_pose(random.state())
     cos, sin = np.cos(random.state().q[:, 0]), np.sin(random.state().q[:, 0])
     x, y, z = (delta_p + info["drawn_pose_error"]).T
     np.testing.assert_allclose(
         obs[:, 14:17].T, [cos * x + sin * y, cos * y - sin * x, z], atol=1e-5
     )
     np.testing.assert_allclose(obs[:, 17], angle + info["drawn_yaw_error"], atol=1e-5)
-    true = np.linalg.norm(delta_p, axis=1) + crane_env.relative_pose(random.state())[1]
+    true = np.linalg.norm(delta_p, axis=1) + crane_task.relative_pose(random.state())[1]
     np.testing.assert_allclose(info["d_combine"], true)
 
 

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 import crane_env
-from crane_env import COMMAND_OF_SERVO, JOINTS, SERVOS, CraneVectorEnv, load_model
+import crane_task
+import machine
+from crane_env import CraneVectorEnv, load_model
+from machine import COMMAND_OF_SERVO, JOINTS, SERVOS
 
 # theta, a, d, alpha of the Denavit-Hartenberg table in assets/README.md; q4 twice
 DH = [
@@ -55,7 +58,7 @@ def grasp_start():
     q[7] = 0.05
     wanted = 0.9 + 0.578 + 0.213  # m, height of the tip joint
     for q4 in np.linspace(0.05, 2.2, 4000):
-        out, up = crane_env.tip_position(q[1], q[2], q4)
+        out, up = crane_task.tip_position(q[1], q[2], q4)
         if up <= wanted:
             break
     q[3] = q4
@@ -107,7 +110,7 @@ def test_tip_position_matches_the_model():
             data.joint(name).qpos = value
         mujoco.mj_kinematics(model, data)
         x, y, z = data.site("tip").xpos
-        np.testing.assert_allclose(crane_env.tip_position(q2, q3, q4), [x, z], atol=1e-9)
+        np.testing.assert_allclose(crane_task.tip_position(q2, q3, q4), [x, z], atol=1e-9)
         assert abs(y) < 1e-9
 
 
@@ -215,7 +218,7 @@ def test_each_servo_settles_on_its_command():
     actions = np.zeros((12, 6))
     for i in range(6):
         actions[2 * i, i], actions[2 * i + 1, i] = 1.0, -1.0
-    low, high = crane_env.SPEEDS["real"]
+    low, high = machine.SPEEDS["real"]
     command = np.where(actions < 0, -actions * low, actions * high)[:, COMMAND_OF_SERVO]
     for _ in range(5):
         envs.advance(actions)
@@ -248,7 +251,7 @@ def test_resting_in_an_end_stop_ends_no_episode():
         for j, value in changes.items():
             q[i, j] = value
     q[:, 4] = np.pi / 2 - q[:, 1] - q[:, 2]
-    out, _ = crane_env.tip_position(*q[:, 1:4].T)  # logs below the grapples, within reach
+    out, _ = crane_task.tip_position(*q[:, 1:4].T)  # logs below the grapples, within reach
     envs = place(q, log_pose=np.stack([out * np.cos(q[:, 0]), out * np.sin(q[:, 0]), 0 * out], 1))
     beyond = []
     for _ in range(50):
@@ -256,7 +259,7 @@ def test_resting_in_an_end_stop_ends_no_episode():
         assert (info["termination"] == "none").all(), dict(zip(RESTING, info["termination"]))
         beyond.append(outward * (envs.state().q[each, joint] - stop))
     assert (np.min(beyond[-20:], axis=0) > 0).all()  # in the stop, not on the way to it
-    assert 0.012 < np.max(beyond) < crane_env.LIMIT_TOLERANCE
+    assert 0.012 < np.max(beyond) < crane_task.LIMIT_TOLERANCE
 
 
 def test_a_servo_in_its_stop_winds_up_to_its_force_and_no_further():
@@ -271,7 +274,7 @@ def test_a_servo_in_its_stop_winds_up_to_its_force_and_no_further():
     for crane, limit in enumerate(limits):
         lead = envs.act[crane, crane] - envs.qpos[crane, crane]
         stiffness = envs.model.actuator_gainprm[8 + crane, 0]
-        within_25_ms = crane_env.SPEEDS["real"][1, crane] * 0.025  # between two clamps
+        within_25_ms = machine.SPEEDS["real"][1, crane] * 0.025  # between two clamps
         assert 0.98 * limit < stiffness * lead < limit + 1.02 * stiffness * within_25_ms
 
 
@@ -292,8 +295,8 @@ def test_idle_crane_stays():
     before = envs.state().q.copy()
     for _ in range(90):
         envs.advance(np.zeros((16, 6)))
-    drift = np.abs(envs.state().q - before)[:, crane_env.ACTUATED]
-    tips = [np.stack(crane_env.tip_position(*q[:, 1:4].T)) for q in (before, envs.state().q)]
+    drift = np.abs(envs.state().q - before)[:, machine.ACTUATED]
+    tips = [np.stack(crane_task.tip_position(*q[:, 1:4].T)) for q in (before, envs.state().q)]
     assert np.abs(tips[0] - tips[1]).max() < 5e-3
     assert drift.max() < 2e-4
 
@@ -326,7 +329,7 @@ def test_held_log_does_not_sag(diameter):
     """Less than 2 cm in 20 s at zero command."""
     envs = lift(diameter)
     start = envs.state().log_centre.copy()
-    assert crane_env.log_clearance(envs.state())[0] > 0.3
+    assert crane_task.log_clearance(envs.state())[0] > 0.3
     for _ in range(200):
         envs.advance(np.zeros((1, 6)))
     sag = start[0, 2] - envs.state().log_centre[0, 2]
@@ -537,7 +540,7 @@ def test_what_is_only_drawn_changes_no_motion(contact):
         for decision in range(30):
             envs.step([[0, decision >= 18, 0, 0, 0, 1]])
             moved[-1].append([*envs.qpos[0], *envs.qvel[0]])
-        assert envs.state().touching.all() and crane_env.log_clearance(envs.state()) > 0.05
+        assert envs.state().touching.all() and crane_task.log_clearance(envs.state()) > 0.05
         models.append(envs.model)
     collides = [(model.geom_contype | model.geom_conaffinity) > 0 for model in models]
     assert collides[0].all() and not collides[1].all() and not models[0].ntex
@@ -545,7 +548,7 @@ def test_what_is_only_drawn_changes_no_motion(contact):
 
 
 def test_committed_meshes_are_what_the_script_writes():
-    path = crane_env.MODEL_PATH.parent / "make_meshes.py"
+    path = machine.MODEL_PATH.parent / "make_meshes.py"
     spec = importlib.util.spec_from_file_location("make_meshes", path)
     make_meshes = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make_meshes)
@@ -558,5 +561,5 @@ def test_import_without_opengl():
     code = "import ctypes.util; ctypes.util.find_library = lambda name: None; import crane_env"
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MUJOCO_GL")}
     command = [sys.executable, "-c", code + "; crane_env.CraneEnv().reset(seed=0)"]
-    root = crane_env.MODEL_PATH.parent.parent
+    root = machine.MODEL_PATH.parent.parent
     subprocess.run(command, cwd=root, env=environment, check=True)

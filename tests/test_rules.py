@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-import crane_env
-from crane_env import CraneState, CraneVectorEnv
+import crane_task
+import machine
+from crane_env import CraneVectorEnv
+from crane_task import CraneState
 
 JOINT_RANGE = CraneVectorEnv(1).joint_range
-REAL = crane_env.SPEEDS["real"]
+REAL = machine.SPEEDS["real"]
 
 
 def state(**changes):
@@ -28,21 +30,21 @@ def state(**changes):
 
 def test_relative_pose():
     # offset (0.8 - 0.4) / 2 = 0.2: target heights 0.2 + 0.2 = 0.4 and 0.2 - 0.2 = 0
-    delta_p, delta_psi, _ = crane_env.relative_pose(state())
+    delta_p, delta_psi, _ = crane_task.relative_pose(state())
     np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.1]])
     np.testing.assert_allclose(delta_psi, [0.2])  # 1 - |0.6 * 0 + 0.8 * 1|
-    delta_p, _, _ = crane_env.relative_pose(state(), offset="minus")
+    delta_p, _, _ = crane_task.relative_pose(state(), offset="minus")
     np.testing.assert_allclose(delta_p, [[3.0, 4.0, -1.5]])
 
 
 def test_angle_is_that_of_a_line_not_of_an_arrow():
     for axis in ([0.0, 1.0, 0.0], [0.0, -1.0, 0.0]):
-        _, delta_psi, signed = crane_env.relative_pose(state(log_axis=axis))
+        _, delta_psi, signed = crane_task.relative_pose(state(log_axis=axis))
         np.testing.assert_allclose(delta_psi, [0.2])
         # the grapple points atan2(0.8, 0.6) = 53.13 degrees, the log 90: 36.87 degrees to the left
         np.testing.assert_allclose(signed, [np.radians(36.8698976)])
     right = np.array([np.cos(0.1), np.sin(0.1), 0.0])
-    _, _, signed = crane_env.relative_pose(state(log_axis=right))
+    _, _, signed = crane_task.relative_pose(state(log_axis=right))
     np.testing.assert_allclose(signed, [0.1 - np.arctan2(0.8, 0.6)])
 
 
@@ -50,7 +52,7 @@ def test_signed_angle_turns_the_grapple_onto_the_log_within_the_rotators_range()
     envs = CraneVectorEnv(300)
     envs.reset(seed=0)
     before = envs.state()
-    _, _, signed = crane_env.relative_pose(before)
+    _, _, signed = crane_task.relative_pose(before)
     assert signed.max() > np.pi / 2 and signed.min() < -np.pi / 2  # the longer turn, both ways
     q, ids = before.q.copy(), np.arange(300)
     q[:, 4], q[:, 5] = np.pi / 2 - q[:, 1] - q[:, 2], np.pi / 2  # plumb
@@ -58,12 +60,12 @@ def test_signed_angle_turns_the_grapple_onto_the_log_within_the_rotators_range()
     log_yaw = np.arctan2(before.log_axis[:, 1], before.log_axis[:, 0]) - np.pi / 2
     log = np.stack([x, y, log_yaw], axis=-1)
     envs.place(ids, q, log, before.diameter)
-    _, _, signed = crane_env.relative_pose(envs.state())
+    _, _, signed = crane_task.relative_pose(envs.state())
     turn = np.arctan2(y, x) - q[:, 0]  # until the crane faces the log
     q[:, 0] += turn
     q[:, 6] += turn - signed  # the grapple's yaw is that of q1 - q7
     envs.place(ids, q, log, before.diameter)
-    _, delta_psi, left = crane_env.relative_pose(envs.state())
+    _, delta_psi, left = crane_task.relative_pose(envs.state())
     np.testing.assert_allclose(delta_psi, 0, atol=1e-6)
     np.testing.assert_allclose(left, 0, atol=1e-3)
     assert np.abs(q[:, 6]).max() < 2.81
@@ -71,13 +73,13 @@ def test_signed_angle_turns_the_grapple_onto_the_log_within_the_rotators_range()
 
 def test_yaw_of_a_tilted_log_is_that_of_its_shadow():
     tilted = np.array([0.0, 0.8, 0.6])
-    _, delta_psi, _ = crane_env.relative_pose(state(log_axis=tilted))
+    _, delta_psi, _ = crane_task.relative_pose(state(log_axis=tilted))
     np.testing.assert_allclose(delta_psi, [0.2])
 
 
 def test_noise():
     # s = (|(0, 4.8, 6.4)| / 8)^2 = 1; and s = 0.25 at half the distance
-    noisy_p, noisy_psi = crane_env.noisy_pose(
+    noisy_p, noisy_psi = crane_task.noisy_pose(
         np.array([[0.0, 4.8, 6.4], [0.0, 2.4, 3.2]]),
         np.array([0.5, 0.5]),
         np.array([[0.1, -0.1], [0.1, -0.1]]),
@@ -87,14 +89,14 @@ def test_noise():
 
 
 def test_clearance_and_miss():
-    np.testing.assert_allclose(crane_env.log_clearance(state()), [0.0])
+    np.testing.assert_allclose(crane_task.log_clearance(state()), [0.0])
     lifted = state(log_centre=[4.0, 6.0, 1.5], log_axis=[0.0, 0.8, 0.6])
     # 1.5 - 1.375 * 0.6 - 0.2 * 0.8
-    np.testing.assert_allclose(crane_env.log_clearance(lifted), [0.515])
+    np.testing.assert_allclose(crane_task.log_clearance(lifted), [0.515])
     upright = state(log_centre=[4.0, 6.0, 2.0], log_axis=[0.0, 0.0, -1.0])
-    np.testing.assert_allclose(crane_env.log_clearance(upright), [0.625])
+    np.testing.assert_allclose(crane_task.log_clearance(upright), [0.625])
     gripped = state(grapple_centre=[4.3, 6.4, 0.2], log_axis=[0.6, 0.8, 0.0])
-    np.testing.assert_allclose(crane_env.centre_miss(gripped), [0.5])
+    np.testing.assert_allclose(crane_task.centre_miss(gripped), [0.5])
 
 
 COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaws, 1.3 with them
@@ -102,9 +104,9 @@ COMMAND = np.array([[0.3, 0.0, 0.4, 0.0, 0.0, 1.2]])  # norm 0.5 without the jaw
 
 def terms_of(crane, d_combine, command, ground=None, **kwargs):
     """The terms of the reward of one crane, without r_ground if no force is given."""
-    given = [np.array([d_combine]), crane_env.log_clearance(crane), crane_env.centre_miss(crane)]
+    given = [np.array([d_combine]), crane_task.log_clearance(crane), crane_task.centre_miss(crane)]
     given += [command, np.zeros(1) if ground is None else ground]
-    terms = crane_env.reward_terms(crane, *given, **kwargs)[:, 0]
+    terms = crane_task.reward_terms(crane, *given, **kwargs)[:, 0]
     assert ground is not None or terms[4] == 0
     return terms[:4] if ground is None else terms
 
@@ -180,7 +182,7 @@ def test_printed_reward_pays_for_standing_still():
 
 
 def rule(time=1.0, reached=True, diverged=False, **changes):
-    name = crane_env.termination_rule(
+    name = crane_task.termination_rule(
         state(**changes),
         np.array([time]),
         np.array([reached]),
@@ -225,7 +227,7 @@ def test_joint_limits_end_the_episode_but_not_those_of_the_jaws(joint, end):
 
 def grip(clearance=0.2, touching=(True, True), miss=0.1):
     values = np.array([clearance]), np.array([touching]), np.array([miss])
-    return crane_env.grip_conditions(*values)[:, 0].tolist()
+    return crane_task.grip_conditions(*values)[:, 0].tolist()
 
 
 def test_grip_conditions():
@@ -251,7 +253,7 @@ def test_grip_conditions():
 def test_success_needs_every_condition(failed, monkeypatch):
     """An idle crane of which we claim all but the failed conditions, from start to end."""
     grip = [name not in failed for name in ("not_lifted", "not_held", "off_centre")]
-    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.array(grip)[:, None])
+    monkeypatch.setattr(crane_task, "grip_conditions", lambda *_: np.array(grip)[:, None])
     envs, ended = CraneVectorEnv(1), False
     envs.reset(seed=0)
     while not ended:
@@ -260,7 +262,7 @@ def test_success_needs_every_condition(failed, monkeypatch):
         _, _, terminated, truncated, info = envs.advance(np.zeros((1, 6)))
         ended = terminated[0] or truncated[0]
         assert ended or not info["success"][0]
-    assert {name for name in crane_env.CONDITIONS if info[name][0]} == failed
+    assert {name for name in crane_task.CONDITIONS if info[name][0]} == failed
     assert info["success"][0] == (not failed)
     late = "not_reached" in failed
     assert info["termination"][0] == ("not_reached" if late else "time_limit")
@@ -275,7 +277,7 @@ def test_the_log_is_reached_by_6_s_or_never(monkeypatch):
         with monkeypatch.context() as patch:
             for k in range(61):
                 if k == first:
-                    patch.setattr(crane_env, "REACH_DISTANCE", 100.0)
+                    patch.setattr(crane_task, "REACH_DISTANCE", 100.0)
                 _, _, terminated, _, info = envs.advance(np.zeros((1, 6)))
                 if k == 59:
                     ends.append((info["termination"][0], terminated[0]))
@@ -302,7 +304,7 @@ def test_success_needs_all_of_the_last_half_second(frame_skip, monkeypatch):
     slips = np.array([0, last - window - 1, *range(last - window, last + 1)])
     envs = CraneVectorEnv(len(slips), frame_skip=frame_skip)
     kept = np.ones((3, len(slips)), bool)
-    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: kept)
+    monkeypatch.setattr(crane_task, "grip_conditions", lambda *_: kept)
     for which, name in enumerate(["not_lifted", "not_held", "off_centre"]):
         envs.reset(seed=0)
         for k in range(last + 1):
@@ -325,7 +327,7 @@ def test_success_needs_the_whole_episode(monkeypatch):
         assert not terminated[0] and truncated[0] == (k == 89) and not info["success"][0]
     assert info["termination"][0] == "time_limit" and info["not_lifted"][0] and info["not_held"][0]
 
-    monkeypatch.setattr(crane_env, "grip_conditions", lambda *_: np.ones((3, 2), bool))
+    monkeypatch.setattr(crane_task, "grip_conditions", lambda *_: np.ones((3, 2), bool))
     envs, lifted = CraneVectorEnv(2), []
     envs.reset(seed=0)
     for k in range(14):
@@ -342,16 +344,16 @@ def test_reward_is_the_sum_of_the_reported_terms(reward):
     envs = CraneVectorEnv(4, reward=reward)
     envs.reset(seed=0)
     _, total, _, _, info = envs.advance(np.full((4, 6), 0.5))
-    terms = [info[term] for term in crane_env.TERMS]
+    terms = [info[term] for term in crane_task.TERMS]
     np.testing.assert_allclose(total, np.sum(terms, axis=0))
     now = envs.state()
-    delta_p, delta_psi, _ = crane_env.relative_pose(now)
+    delta_p, delta_psi, _ = crane_task.relative_pose(now)
     delta_p[:, 2] += 0.1 if reward == "staged" else 0.0  # the reward wants the grapple higher
     distance = np.linalg.norm(delta_p, axis=-1) + delta_psi
-    measured = distance, crane_env.log_clearance(now), crane_env.centre_miss(now)
+    measured = distance, crane_task.log_clearance(now), crane_task.centre_miss(now)
     command = np.tile(0.5 * REAL[1], (4, 1))
     np.testing.assert_allclose(
-        terms, crane_env.reward_terms(now, *measured, command, np.zeros(4), 1.0, reward)
+        terms, crane_task.reward_terms(now, *measured, command, np.zeros(4), 1.0, reward)
     )
 
 
@@ -360,7 +362,7 @@ def test_time_to_reach_is_the_first_time():
     envs.reset(seed=0)
     q = envs.state().q.copy()
     for q4 in np.linspace(q[0, 3], 2.2, 400):  # hang the grapple into its target
-        out, up = crane_env.tip_position(q[0, 1], q[0, 2], q4)
+        out, up = crane_task.tip_position(q[0, 1], q[0, 2], q4)
         if up < 0.55 + 0.1 + 0.791:
             break
     q[0, 3] = q4

@@ -6,7 +6,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-import crane_env
+import crane_task
 import crane_trials
 from crane_env import CraneVectorEnv
 from sb3_crane import CraneVecEnv
@@ -45,7 +45,7 @@ def test_steps_are_the_cranes():
 
 
 def test_a_truncated_episode_says_so(monkeypatch):
-    monkeypatch.setattr(crane_env, "TIME_LIMIT", 0.3)
+    monkeypatch.setattr(crane_task, "TIME_LIMIT", 0.3)
     view = CraneVecEnv(2)
     view.reset()
     for _ in range(3):
@@ -69,7 +69,7 @@ def test_attributes_and_options():
 
 def test_sb3_trains_saves_and_is_judged(tmp_path, monkeypatch):
     """The README's recipe. Success reaches SB3's own log."""
-    monkeypatch.setattr(crane_env, "REACH_TIME", 0.5)  # every episode ends soon
+    monkeypatch.setattr(crane_task, "REACH_TIME", 0.5)  # every episode ends soon
     model = PPO("MlpPolicy", VecMonitor(CraneVecEnv(8)), n_steps=16, batch_size=64, device="cpu")
     model.learn(256)
     assert list(model.ep_success_buffer) and len(model.ep_info_buffer) == len(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import crane_env
+import crane_task
 from crane_env import CraneVectorEnv
 from crane_trials import monte_carlo_trials
 from scripted_crane import (
@@ -51,7 +51,7 @@ def test_jacobian_is_the_derivative_of_the_plumb_grapples_pose():
 
 def test_rates_do_the_task_where_trials_start():
     rng = np.random.default_rng(0)
-    q = np.array([crane_env.sample_start(rng)[0] for _ in range(200)])
+    q = np.array([crane_task.sample_start(rng)[0] for _ in range(200)])
     jacobian = plumb_jacobian(forward_kinematics(plumb(q))) * SPEED
     task = rng.normal(size=(200, 4))
     error = (jacobian @ damped_least_squares(jacobian, task, DAMPING)[:, :, None])[:, :, 0] - task

@@ -26,6 +26,8 @@ from script_runs import (
 )
 
 import crane_env
+import crane_options
+import crane_task
 import crane_trials
 
 
@@ -288,7 +290,7 @@ def test_two_updates_on_the_crane_same_seed_same_weights(tmp_path, run_here, alg
         assert "critic.0.weight" in checkpoint["weights"]
         weights.append(checkpoint["weights"])
         script = module(algorithm)
-        options = crane_env.complete(script.Args().env)
+        options = crane_options.complete(script.Args().env)
         task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **options}
         assert policy["task"] == checkpoint["task"] == task
         assert script.Args(**policy["args"]).seed == int(seed)
@@ -333,14 +335,14 @@ def test_the_papers_task_trains(tmp_path, run_here, algorithm):
     assert task == {
         "env_id": "ForestryCranePaper-v0",
         "revision": crane_env.REVISION,
-        **crane_env.complete(crane_env.PAPER),
+        **crane_options.complete(crane_options.PAPER),
     }
     values = scalars(only_run(tmp_path))
     growth = 3 ** (1 - 0.5 / 0.75)  # in the second half of the run
     gamma = [0.9**0.05, (1 - 0.1 / growth) ** 0.05]
     assert values["charts/gamma"] == pytest.approx(gamma, abs=1e-7)
     scale = 0.06 * 0.05 / growth
-    paid = np.mean([sum(info[term] for term in crane_env.TERMS) for info in left["infos"]])
+    paid = np.mean([sum(info[term] for term in crane_task.TERMS) for info in left["infos"]])
     assert left["rewards"].mean().item() == pytest.approx(scale * paid, rel=1e-5)
     rates = np.array(values["charts/simulation_SPS"]) / values["charts/SPS"]
     np.testing.assert_allclose(rates, 1, rtol=1e-5)
@@ -546,7 +548,7 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         return " ".join(box.split()) if error.value.code == 2 else str(error.value)
 
     args = vars(module(algorithm).Args())
-    task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_env.DEFAULTS}
+    task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_options.DEFAULTS}
     ours = {"algorithm": algorithm, "task": task, "args": args}
     (tmp_path / "policy").mkdir()
     torch.save({**ours, "weights": {}, "global_step": 64}, tmp_path / "policy" / "checkpoint.pt")
@@ -631,7 +633,7 @@ def test_help_explains_every_argument(run_here, capsys, algorithm):
     text = re.sub(r", --(env\.)?no-\S+", "", text)  # of a switch
     told = dict(part.split(" ", 1) for part in re.split(r" (?=--)", text)[1:])
     arguments = [name for name in module(algorithm).Args.__dataclass_fields__ if name != "env"]
-    arguments += [f"env.{name}" for name in crane_env.DEFAULTS]
+    arguments += [f"env.{name}" for name in crane_options.DEFAULTS]
     flags = ["--" + name.replace("_", "-") for name in arguments]
     assert set(told) == {"--help", *flags}
     for flag in flags:  # values in capitals or braces, then words, then the default

@@ -9,7 +9,8 @@ import pytest
 import recall_env  # noqa: F401  registers Endless-v0 and others
 from gymnasium.vector import AutoresetMode
 
-import crane_env
+import crane_options
+import crane_task
 import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv
@@ -58,7 +59,7 @@ def test_make_envs_gives_the_crane_its_options():
     envs = make_envs("OtherCrane-v0", 2, 1, diameter=diameters, frame_skip=10, reward="paper")
     crane = envs.unwrapped
     assert type(crane) is OtherCrane and envs.num_envs == 2
-    assert crane.options == crane_env.complete({"frame_skip": 10, "reward": "paper"})
+    assert crane.options == crane_options.complete({"frame_skip": 10, "reward": "paper"})
     envs.reset(seed=0)
     np.testing.assert_allclose(crane.state().diameter, diameters)
     with pytest.raises(ValueError, match="no option 'frame_skp'"):
@@ -104,7 +105,7 @@ def test_rollout_report_of_cranes():
     assert rollout_report(envs, [step_info(["none"] * 3, [False], r_grapple=0, r_lift=0)]) == {
         "charts/difficulty": 1.0,
         **{f"reward/{name}": 0.0 for name in ("distance", "grapple", "lift", "balance", "ground")},
-        **{f"termination/{name}": 0.0 for name in crane_env.TERMINATIONS},
+        **{f"termination/{name}": 0.0 for name in crane_task.TERMINATIONS},
     }
     crane.difficulty = 0.35
     crane.recent_success.extend([True, False, True, True])
@@ -237,7 +238,7 @@ def test_training_and_judging_agree():
     assert scores.pop("episodic_return") == pytest.approx(returns.mean())
     assert scores.pop("success_rate") == pytest.approx(success.mean())
     assert scores.pop("gentle_rate") == pytest.approx(gentle.mean())
-    expected = {f"success_rate_{d}m": success[diameters == d].mean() for d in crane_env.DIAMETERS}
+    expected = {f"success_rate_{d}m": success[diameters == d].mean() for d in crane_task.DIAMETERS}
     assert scores == pytest.approx(expected) and scores.keys() == expected.keys()
 
     args = eval_crane.Args(trials=trials, seed=seed, env_threads=1)
