@@ -1,21 +1,15 @@
-"""What surrounds a policy: cranes to train and to judge it on, trials, files, errors.
+"""Cranes to train a policy and to judge it on, and the trials that judge it.
 
 The training scripts and eval_crane.py use it. The protocol of the trials is docs/results.md's:
 log diameters 0.3 ... 0.8 m, seeds that belong to the trial alone, success as `CraneVectorEnv` says.
 """
 
 import importlib
-import os
-import sys
-import threading
 from collections.abc import Sequence
-from pathlib import Path
-from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 import gymnasium
 import numpy as np
-from filelock import FileLock, Timeout
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
@@ -27,51 +21,6 @@ from crane_task import CONDITIONS, DIAMETERS, TERMINATIONS, TERMS
 
 RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
 RESULTS |= {*CONDITIONS, *CARE}
-LOCKS: list[FileLock] = []  # of the folders in which this process trains
-
-
-def one_line_errors(hint: str = "") -> None:
-    """From now on, files that cannot be used and Ctrl-C end with one line and no traceback.
-
-    hint follows a file's error. All other errors keep their traceback.
-    """
-
-    def report(kind: type, error: BaseException, trace: TracebackType | None) -> None:
-        if issubclass(kind, KeyboardInterrupt):
-            say("\ninterrupted", sys.stderr)
-        elif issubclass(kind, OSError):
-            say(f"\n{kind.__name__}: {error}{hint}", sys.stderr)
-        else:
-            sys.__excepthook__(kind, error, trace)
-        if issubclass(kind, BrokenPipeError):
-            say("", sys.stdout)
-
-    def report_of_thread(args: threading.ExceptHookArgs) -> None:
-        # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
-        if not issubclass(args.exc_type, OSError):
-            threading.__excepthook__(args)
-
-    sys.excepthook, threading.excepthook = report, report_of_thread
-
-
-def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line, unless the terminal or the pipe is closed. Then nothing more goes there."""
-    stream = stream or sys.stdout
-    try:
-        print(line, file=stream, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def lock_folder(folder: Path) -> None:
-    """Make a run's folder and hold its lock until the process ends. SystemExit if another does."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / "lock", blocking=False)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise SystemExit(f"another process trains in {folder}") from None
-    LOCKS.append(lock)
 
 
 def is_crane(env_id: str) -> bool:

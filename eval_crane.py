@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 import crane_env
 import crane_options
+import crane_runs
 import crane_task
 import crane_trials
 import machine
@@ -368,7 +369,7 @@ def check_combinations(args: Args) -> None:
 
 
 def main() -> None:
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     check_combinations(args)
     task = {"env_id": "ForestryCrane-v0"}

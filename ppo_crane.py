@@ -23,12 +23,10 @@ Along the run the policy narrows, the horizon grows, the step size falls (docs/p
         --log-std-init 0.5
 """
 
-import io
 import os
-import signal
 import time
 from collections import defaultdict
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -38,21 +36,16 @@ os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 import gymnasium
 import numpy as np
 import torch
-import tyro
 from torch import Tensor, nn
 from torch.distributions import Normal
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 import crane_env
 import crane_options
+import crane_runs
 import crane_trials
 from crane_options import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
 
 ALGORITHM = "ppo"
-MAX_BATCH = 2**20  # decisions of a rollout, all in memory
-CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads", "env"}
-SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
 
 
 @dataclass
@@ -82,7 +75,7 @@ class Args:
     horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
-    minibatch_size: Annotated[int, Range(2, MAX_BATCH)] = 1024  # decisions per gradient step
+    minibatch_size: Count = 1024  # decisions per gradient step
     update_epochs: Times = 8  # passes over each rollout
     clip_coef: Factor = 0.2  # c, bound of the ratio's change
     target_kl: Factor | None = 0.04  # stop after the first epoch whose mean KL exceeds this
@@ -189,50 +182,11 @@ def compute_gae(
     return advantages
 
 
-def load_checkpoint(folder: Path) -> tuple[dict, Args]:
-    """checkpoint.pt in a run's folder, and the run's arguments with those of the command line."""
-    path = folder / "checkpoint.pt"
-    if not path.is_file():
-        raise SystemExit(f"--resume: there is no {path}")
-    crane_trials.lock_folder(folder)
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        task, algorithm = checkpoint["task"], checkpoint["algorithm"]
-        revision = task.get("revision", crane_env.REVISION)  # only the crane has one
-        if (algorithm, revision) != (ALGORITHM, crane_env.REVISION):
-            raise SystemExit(f"--resume: {path} is of {algorithm}, task revision {revision}")
-        if not {"weights", "optimizer", "iteration"} <= checkpoint.keys():
-            raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
-        # every option as it was, should a default have changed since
-        options = {name: task[name] for name in crane_options.DEFAULTS if name in task}
-        options = checkpoint["args"]["env"] | options
-        saved = Args(**checkpoint["args"] | {"env": options})
-    except Exception:  # a damaged file raises many kinds
-        raise SystemExit(f"--resume: {path} is damaged or not of this script") from None
-    args = tyro.cli(Args, default=saved)
-    given = vars(args) | args.env
-    for name, value in (vars(saved) | options).items():
-        if value != given[name] and name not in CHANGEABLE:
-            raise SystemExit(f"--resume: this run has {name} {value}; leave the argument out")
-    return checkpoint, args
-
-
 if __name__ == "__main__":
-    crane_trials.one_line_errors()
-    args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
-    checkpoint = None
-    if args.resume is not None:
-        checkpoint, args = load_checkpoint(args.resume)
-    if args.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("--device cuda: torch finds no GPU; use --device cpu")
+    args, checkpoint = crane_runs.read_arguments(ALGORITHM, Args, __doc__)
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
-    if batch_size > MAX_BATCH:
-        raise SystemExit(f"--num-envs times --num-steps must be at most {MAX_BATCH:,}")
-    num_iterations = max(1, args.total_timesteps // batch_size)
-    if checkpoint is not None and checkpoint["iteration"] > num_iterations:
-        raise SystemExit("--resume: more --total-timesteps than these are done already")
-    if batch_size % args.minibatch_size == 1:
+    if 1 in (args.minibatch_size, batch_size % args.minibatch_size):
         raise SystemExit("--minibatch-size leaves a single decision, with no standard deviation")
 
     def to_tensor(x: np.ndarray) -> Tensor:
@@ -254,104 +208,24 @@ if __name__ == "__main__":
     torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    first_iteration = 1 if checkpoint is None else checkpoint["iteration"] + 1
-    env_seed = int(np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0])
-    if checkpoint is not None:
-        agent.load_state_dict(checkpoint["weights"])
-        optimizer.load_state_dict(checkpoint["optimizer"])
-        torch.manual_seed(env_seed)  # new episodes and new samples
-
-    # Files
-    run_name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
-    run_dir = args.resume or Path("runs", run_name.replace("/", "-"))
-    if args.resume is None:
-        crane_trials.lock_folder(run_dir)
-    writer = SummaryWriter(run_dir, purge_step=(first_iteration - 1) * batch_size + 1)
-    writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
-    task = {"env_id": args.env_id, **(envs.unwrapped.task if is_crane else {})}
-    stop_signals: list[int] = []
-    remaining = range(first_iteration, num_iterations + 1)
-    final_scores = {} if checkpoint is None or remaining else checkpoint.get("final_scores", {})
-
-    def save(iteration: int) -> None:
-        """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
-        writer.flush()
-        weights = agent.state_dict()
-        acting = {name: w for name, w in weights.items() if not name.startswith("critic.")}
-        policy = {"algorithm": ALGORITHM, "task": task, "args": asdict(args) | {"resume": None}}
-        policy |= {"weights": acting, "global_step": iteration * batch_size}
-        state = {"weights": weights, "optimizer": optimizer.state_dict(), "iteration": iteration}
-        state["final_scores"] = final_scores
-        # A kill or a full disk leaves the old files whole.
-        for name, contents in (("policy", policy), ("checkpoint", policy | state)):
-            buffer = io.BytesIO()  # torch would turn a full disk into a RuntimeError
-            torch.save(contents, buffer)
-            (run_dir / f"{name}.tmp").write_bytes(buffer.getvalue())
-            os.replace(run_dir / f"{name}.tmp", run_dir / f"{name}.pt")
-        # from now on an error can say how to go on
-        crane_trials.one_line_errors(f"; mend this, then go on with --resume {run_dir}")
-
-    def evaluate(name: str, trials: int, iteration: int) -> dict[str, float]:
-        protocol = {"trials": trials, "seed": args.eval_seed, "env_threads": args.env_threads}
-        scores = crane_trials.evaluate(agent, args.env_id, **protocol, **args.env)
-        for key, value in scores.items():
-            writer.add_scalar(f"{name}/{key}", value, iteration * batch_size)
-        return scores
+    run = crane_runs.Run(ALGORITHM, args, envs, agent, optimizer, checkpoint)
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        progress = iteration / num_iterations
+        progress = iteration / run.num_iterations
         share = progress / args.warm_up if progress < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
-
-    def finish_update(iteration: int, report: dict[str, float]) -> None:
-        """Write the report. Evaluate and save when it is time to, and stop if a signal came."""
-        wrong = [name for name, value in report.items() if not np.isfinite(value)]
-        if wrong or not all(tensor.isfinite().all() for tensor in agent.state_dict().values()):
-            bar.close()
-            what = ", ".join(wrong[:2]) or "the weights"
-            mend = "lower --learning-rate or look at the task's rewards"
-            raise SystemExit(f"update {iteration}: {what} not finite; {mend}")
-        for key, value in report.items():
-            writer.add_scalar(key, value, iteration * batch_size)
-        last = iteration == num_iterations
-        if args.eval_every and (iteration % args.eval_every == 0 or last):
-            evaluate("eval", args.eval_trials, iteration)
-        stopping = bool(stop_signals)
-        if iteration % 10 == 0 or last or stopping:
-            save(iteration)
-        if stopping:
-            bar.close()
-            crane_trials.say(f"stopped after update {iteration}; go on with --resume {run_dir}")
-            raise SystemExit(128 + stop_signals[0])
-        bar.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
-
-    def stop_after_update(signum: int, frame: object) -> None:
-        """Ctrl-C, kill or a closed terminal: finish the update. A second Ctrl-C: stop at once."""
-        stop_signals.append(signum)
-        if signum == signal.SIGINT:
-            signal.signal(signum, signal.SIG_DFL)
-
-    signals = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)}
-    handlers = {signum: signal.getsignal(signum) for signum in signals}
-    for signum, handler in handlers.items():
-        if handler != signal.SIG_IGN:  # nohup ignores some
-            signal.signal(signum, stop_after_update)
-    print(f"writing to {run_dir}", flush=True)
 
     # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(first_iteration)
-    next_obs = to_tensor(envs.reset(seed=env_seed)[0])
-    if not remaining:
-        print(f"all {num_iterations} updates are done; more --total-timesteps extend the run")
-    bar = tqdm(remaining, initial=first_iteration - 1, total=num_iterations)
-    for iteration in bar:
+    set_difficulty(run.first_iteration)
+    next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
+    for iteration in run.iterations():
         # Schedules
-        left = 1.0 - (iteration - 1.0) / num_iterations
+        left = 1.0 - (iteration - 1.0) / run.num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
@@ -422,7 +296,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.log_std -= args.narrowing / num_iterations  # by schedule, not by gradient
+            agent.log_std -= args.narrowing / run.num_iterations  # not by gradient
 
         # Reports
         now = time.time()
@@ -436,14 +310,6 @@ if __name__ == "__main__":
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
         report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
-        finish_update(iteration, report)
+        run.finish_update(iteration, report)
 
-    print(f"policy saved to {run_dir / 'policy.pt'}", flush=True)
-    for signum, handler in handlers.items():  # all is saved
-        signal.signal(signum, handler)
-    if args.final_trials and not final_scores:
-        final_scores = evaluate("final", args.final_trials, num_iterations)
-        save(num_iterations)
-    for name, score in final_scores.items():
-        print(f"final/{name}: {score:.3f}", flush=True)
-    writer.close()
+    run.finish()

@@ -35,6 +35,7 @@ import torch
 import tyro
 
 import crane_options
+import crane_runs
 import crane_trials
 import eval_crane
 from crane_options import Seed
@@ -200,7 +201,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def main() -> None:
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     if not args.results.parent.is_dir():
         raise SystemExit(f"--results: no folder {args.results.parent}; make it first")

@@ -33,6 +33,7 @@ from tyro.conf import Positional
 
 import crane_env
 import crane_options
+import crane_runs
 import crane_trials
 import eval_crane
 import machine
@@ -214,5 +215,5 @@ def main(
 
 
 if __name__ == "__main__":
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     tyro.cli(main, description=__doc__)

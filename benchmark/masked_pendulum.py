@@ -28,7 +28,7 @@ from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.wrappers import TransformObservation
 
 import crane_options
-import crane_trials
+import crane_runs
 from crane_options import Count, Seed
 
 HERE = Path(__file__).parent
@@ -80,7 +80,7 @@ def train(algorithm: str, seed: int, steps: int) -> list[tuple[int, float]]:
 
 
 if __name__ == "__main__":
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     rows = list(csv.reader(open(RESULTS)))[1:] if RESULTS.exists() else []
     for seed in args.seeds:

@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from test_hydraulics import AXES, LABS_FIT, MEASURED, TIMES, response
 
-import crane_trials
+import crane_runs
 import machine
 
 FIGURE = Path(__file__).parent.parent / "assets" / "figures" / "drives.svg"
@@ -45,5 +45,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     tyro.cli(main, description=__doc__)

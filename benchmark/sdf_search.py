@@ -28,6 +28,7 @@ import tyro
 from tyro.conf import Positional
 
 import crane_env
+import crane_runs
 import crane_trials
 import eval_crane
 import machine
@@ -95,5 +96,5 @@ def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
 
 
 if __name__ == "__main__":
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     tyro.cli(main, description=__doc__)

@@ -34,7 +34,7 @@ from tyro.conf import Positional
 
 import crane_env
 import crane_options
-import crane_trials
+import crane_runs
 import eval_crane
 from crane_env import CraneVectorEnv
 
@@ -215,5 +215,5 @@ def main(part: Positional[Literal["steps", "memory", "kills", "arguments"]]) -> 
 
 
 if __name__ == "__main__":
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     tyro.cli(main, description=__doc__)

@@ -55,8 +55,8 @@ from plain_crane import NumpyCrane, PlainCrane, disagreement
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
+import crane_runs
 import crane_task
-import crane_trials
 import eval_crane
 from crane_env import CraneVectorEnv
 
@@ -425,7 +425,7 @@ def ratios(results: Results) -> list[tuple[str, float, float, float]]:
 
 
 def main() -> None:
-    crane_trials.one_line_errors()
+    crane_runs.one_line_errors()
     args = tyro.cli(Args, description=__doc__)
     full = not args.quick and set(args.only) == set(PARTS)
     path = args.csv or (RESULTS if full else None)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from script_runs import ROOT
 
-import crane_trials  # crane_env before any test imports mujoco, which looks for OpenGL
+import crane_runs
 
 torch.set_num_threads(1)  # the batches are too small for more
 
@@ -36,8 +36,8 @@ def run_here(tmp_path, monkeypatch):
             return runpy.run_path(file, run_name="__main__")
         finally:
             torch.set_num_threads(threads)
-            while crane_trials.LOCKS:  # which a script holds until its process ends
-                crane_trials.LOCKS.pop().release()
+            while crane_runs.LOCKS:  # which a script holds until its process ends
+                crane_runs.LOCKS.pop().release()
             for signum, handler in handlers.items():
                 signal.signal(signum, handler)
 

@@ -19,6 +19,7 @@ from script_runs import ALGORITHMS, command, environment, module, only_run, run,
 
 import crane_env
 import crane_options
+import crane_runs
 import crane_trials
 import eval_crane
 from crane_options import Range
@@ -220,7 +221,7 @@ def test_a_closed_terminal_changes_no_exit_status(tmp_path, signum, code):
 )
 def test_errors_that_need_one_line(capsys, monkeypatch, error, said):
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    crane_trials.one_line_errors(" hint")
+    crane_runs.one_line_errors(" hint")
     sys.excepthook(type(error), error, None)
     hint = " hint" if isinstance(error, OSError) else ""
     assert capsys.readouterr().err == f"\n{said}{hint}\n"

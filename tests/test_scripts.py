@@ -456,7 +456,7 @@ def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, monkeypatch, al
     path = folder / "checkpoint.pt"
     torch.save(torch.load(path, weights_only=True) | {"iteration": 2}, path)
     left = run_here(algorithm, "--resume", folder)
-    assert left["first_iteration"] == 3 and left["envs"].unwrapped.difficulty == 0.8
+    assert left["run"].first_iteration == 3 and left["envs"].unwrapped.difficulty == 0.8
     np.testing.assert_allclose(scalars(folder)["charts/difficulty"][2:4], [0.6, 0.8], rtol=1e-6)
     np.testing.assert_allclose(first, [0.2, 0.6], rtol=1e-6)
 
