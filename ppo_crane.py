@@ -230,6 +230,7 @@ if __name__ == "__main__":
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
+        narrowing = args.narrowing / run.num_iterations
         set_difficulty(iteration)
 
         # Rollout
@@ -296,7 +297,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.log_std -= args.narrowing / run.num_iterations  # not by gradient
+            agent.log_std -= narrowing  # by schedule, not by gradient
 
         # Reports
         now = time.time()

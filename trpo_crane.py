@@ -313,6 +313,7 @@ if __name__ == "__main__":
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
+        narrowing = args.narrowing / run.num_iterations
         set_difficulty(iteration)
 
         # Rollout
@@ -382,7 +383,7 @@ if __name__ == "__main__":
                 stats["losses/value_loss"].append(value_loss.item())
                 stats["losses/grad_norm"].append(grad_norm.item())
         with torch.no_grad():
-            agent.log_std -= args.narrowing / run.num_iterations  # not by gradient
+            agent.log_std -= narrowing  # by schedule, not by gradient
 
         # Reports
         now = time.time()
