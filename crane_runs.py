@@ -131,7 +131,8 @@ class Run:
     """What a training leaves on disk, and what can stop it.
 
     algorithm, args, checkpoint: as in `read_arguments`. A checkpoint's weights go to the agent,
-    its state to the optimizer. envs: of `crane_trials.make_envs`.
+    its state to the optimizer. envs: of `crane_trials.make_envs`. rank: of this process, if several
+    train together. Only rank 0 has a folder, writes and evaluates.
 
     Attributes: `num_iterations` updates in all, `first_iteration`, the folder `dir`, and `env_seed`
     for the first reset. A resumed run draws new episodes and samples.
@@ -145,8 +146,9 @@ class Run:
         agent: nn.Module,
         optimizer: Optimizer,
         checkpoint: dict | None,
+        rank: int = 0,
     ):
-        self.algorithm, self.args = algorithm, args
+        self.algorithm, self.args, self.rank = algorithm, args, rank
         self.agent, self.optimizer = agent, optimizer
         self.batch_size = args.num_envs * args.num_steps
         self.num_iterations = max(1, args.total_timesteps // self.batch_size)
@@ -162,13 +164,15 @@ class Run:
             if done == self.num_iterations:
                 self.final_scores = checkpoint.get("final_scores", {})
 
-        name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
-        self.dir = args.resume or Path("runs", name.replace("/", "-"))
-        if args.resume is None:
-            lock_folder(self.dir)
-        self.writer = SummaryWriter(self.dir, purge_step=done * self.batch_size + 1)
-        lines = [f"    {name}: {value}" for name, value in asdict(args).items()]
-        self.writer.add_text("hyperparameters", "\n".join(lines))
+        if rank == 0:
+            name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{os.getpid()}"
+            self.dir = args.resume or Path("runs", name.replace("/", "-"))
+            if args.resume is None:
+                lock_folder(self.dir)
+            self.writer = SummaryWriter(self.dir, purge_step=done * self.batch_size + 1)
+            lines = [f"    {name}: {value}" for name, value in asdict(args).items()]
+            self.writer.add_text("hyperparameters", "\n".join(lines))
+            print(f"writing to {self.dir}", flush=True)
         on_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
         self.task = {"env_id": args.env_id, **(envs.unwrapped.task if on_crane else {})}
 
@@ -178,7 +182,6 @@ class Run:
         for signum, handler in self.handlers.items():
             if handler != signal.SIG_IGN:  # nohup ignores some
                 signal.signal(signum, self.stop_after_update)
-        print(f"writing to {self.dir}", flush=True)
 
     def stop_after_update(self, signum: int, frame: object) -> None:
         """Ctrl-C, kill or a closed terminal: finish the update. A second Ctrl-C: stop at once."""
@@ -189,10 +192,11 @@ class Run:
     def iterations(self) -> tqdm:
         """The numbers of the updates to make, with a progress bar."""
         remaining = range(self.first_iteration, self.num_iterations + 1)
-        if not remaining:
+        if not remaining and self.rank == 0:
             done = f"all {self.num_iterations} updates are done"
             print(f"{done}; more --total-timesteps extend the run")
-        self.bar = tqdm(remaining, initial=self.first_iteration - 1, total=self.num_iterations)
+        count = {"initial": self.first_iteration - 1, "total": self.num_iterations}
+        self.bar = tqdm(remaining, **count, disable=self.rank > 0)
         return self.bar
 
     def finish_update(self, iteration: int, report: dict[str, float]) -> None:
@@ -204,16 +208,18 @@ class Run:
             what = ", ".join(wrong[:2]) or "the weights"
             mend = "lower --learning-rate (TRPO: --max-kl) or look at the task's rewards"
             raise SystemExit(f"update {iteration}: {what} not finite; {mend}")
-        for key, value in report.items():
-            self.writer.add_scalar(key, value, iteration * self.batch_size)
-        if args.eval_every and (iteration % args.eval_every == 0 or last):
-            self.evaluate("eval", args.eval_trials, iteration)
+        if self.rank == 0:
+            for key, value in report.items():
+                self.writer.add_scalar(key, value, iteration * self.batch_size)
+            if args.eval_every and (iteration % args.eval_every == 0 or last):
+                self.evaluate("eval", args.eval_trials, iteration)
         stopping = bool(self.stop_signals)
-        if iteration % 10 == 0 or last or stopping:
+        if self.rank == 0 and (iteration % 10 == 0 or last or stopping):
             self.save(iteration)
         if stopping:
             self.bar.close()
-            say(f"stopped after update {iteration}; go on with --resume {self.dir}")
+            if self.rank == 0:
+                say(f"stopped after update {iteration}; go on with --resume {self.dir}")
             raise SystemExit(128 + self.stop_signals[0])
         self.bar.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
@@ -247,9 +253,11 @@ class Run:
 
     def finish(self) -> None:
         """Final trials, unless they were made already."""
-        print(f"policy saved to {self.dir / 'policy.pt'}", flush=True)
         for signum, handler in self.handlers.items():  # all is saved
             signal.signal(signum, handler)
+        if self.rank > 0:
+            return
+        print(f"policy saved to {self.dir / 'policy.pt'}", flush=True)
         if self.args.final_trials and not self.final_scores:
             trials = self.args.final_trials
             self.final_scores = self.evaluate("final", trials, self.num_iterations)

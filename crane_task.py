@@ -193,7 +193,7 @@ def reward_terms(
         centred = np.exp(-((miss / LIFT_MISS) ** 2))
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
-        hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, 1)
+        hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, 3)
         r_ground = -GROUND_WEIGHT * difficulty**2 * hardness
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
