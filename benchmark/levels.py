@@ -5,10 +5,11 @@
     python benchmark/levels.py draw      # assets/figures/robustness.svg from the sweeps
 
 The levels are ideal (ForestryCrane-v0), hydraulic (ForestryCraneHydraulic-v0) and randomized
-(ForestryCraneRandomized-v0). assets/policies/<script>.pt was trained on the first level,
-<script>_<level>.pt on the others. `table` writes benchmark/levels.csv, `sweeps` writes
-benchmark/robustness.csv, half an hour each. Rows that a file has already are not measured again:
-delete the file when a policy has changed.
+(ForestryCraneRandomized-v0). Policies come from the finished runs of `make_runs.py curves` and
+`make_runs.py levels`. Where there is no run with seed 1, the shipped policy stands for it:
+assets/policies/<script>.pt of the first level, <script>_<level>.pt of the others. `table` writes
+benchmark/levels.csv, `sweeps` writes benchmark/robustness.csv, half an hour each. Rows that a file
+has already are not measured again: delete the file when a policy has changed.
 """
 
 import csv
@@ -65,15 +66,20 @@ SWEEPS = {  # what is changed, and to what
 }
 
 
-def policy_of(method: str, level: str) -> tuple[Any, dict[str, Any]] | None:
-    """A shipped policy and the task it was trained on, None if there is none."""
+def policy_of(method: str, level: str, seed: int = 1) -> tuple[Any, dict[str, Any]] | None:
+    """A trained policy and the task it was trained on, None if there is none."""
     if METHODS[method] is None:
         settings = {"ideal": IDEAL, "hydraulic": HYDRAULIC}  # a random machine is hydraulic too
-        if level not in settings:
+        if level not in settings or seed > 1:
             return None
         return ScriptedCrane(settings=settings[level]), {"sensors": False}
-    path = POLICIES / f"{METHODS[method]}{'' if level == 'ideal' else f'_{level}'}.pt"
-    return eval_crane.load_policy(path)[:2] if path.is_file() else None
+    script = METHODS[method]
+    name = f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
+    shipped = POLICIES / f"{script}{'' if level == 'ideal' else f'_{level}'}.pt"
+    for path in [*HERE.glob(f"runs/*__{name}__{seed}__*/policy.pt"), shipped]:
+        if path != shipped or (seed == 1 and path.is_file()):
+            return eval_crane.load_policy(path)[:2]
+    return None
 
 
 def judge(
@@ -181,17 +187,18 @@ def main(
     """trials: per log diameter; seed: of the trials."""
     crane_options.check({"trials": trials, "seed": seed}, main)
     torch.set_num_threads(1)
-    protocol = {"per_diameter": trials, "seed": seed}
+    protocol = {"per_diameter": trials, "trial_seed": seed}
     if what == "table":
         jobs = [
-            {"method": method, "trained_on": trained_on, "judged_on": judged_on, **protocol}
+            {"method": method, "trained_on": level, "seed": k, "judged_on": judged_on, **protocol}
+            for k in (1, 2, 3)
             for method in METHODS
-            for trained_on in LEVELS
+            for level in LEVELS
             for judged_on in LEVELS
         ]
 
         def measure(job: dict) -> dict[str, float] | None:
-            found = policy_of(job["method"], job["trained_on"])
+            found = policy_of(job["method"], job["trained_on"], job["seed"])
             return None if found is None else judge(*found, job["judged_on"], trials, seed)
 
         append(HERE / "levels.csv", jobs, measure)

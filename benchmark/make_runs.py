@@ -1,13 +1,14 @@
 """Make the training runs behind the figures.
 
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
+    python benchmark/make_runs.py levels      # the same on the two harder levels; 6 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
     python benchmark/make_runs.py timed       # mPPO, three seeds, one at a time; half an hour
     python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of all but the ablations
 
 Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
 
-Run the script again to go on. It skips each run that has a CSV file in benchmark/curves/,
+Run the script again to go on. It skips each run that has a CSV file in benchmark/curves/, levels/,
 ablations/ or timed/. It resumes an interrupted run from its checkpoint in benchmark/runs/. To make
 a run again, delete both. After a change of the task or of a default, delete all of benchmark/runs/.
 """
@@ -28,6 +29,10 @@ from tyro.conf import Positional
 
 HERE = Path(__file__).parent
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
+LEVELS = {  # flags by name
+    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 2048000",
+    "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000",
+}
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
 # Script and flags by name. At another decision rate the number of simulation steps, updates and
@@ -108,12 +113,19 @@ def evaluate() -> None:
         writer.writerows(rows.values())
 
 
-def main(what: Positional[Literal["curves", "ablations", "timed", "evaluate"]]) -> None:
+def main(what: Positional[Literal["curves", "levels", "ablations", "timed", "evaluate"]]) -> None:
     if what == "evaluate":
         return evaluate()
     often = ["--eval-every", "25"]
     if what == "curves":
         jobs = [(name, name, seed, often, 1) for seed in (1, 2, 3) for name in SCRIPTS]
+    elif what == "levels":
+        jobs = [
+            (name, f"{name}_{level}", seed, [*often, *flags.split()], 1)
+            for seed in (1, 2, 3)
+            for level, flags in LEVELS.items()
+            for name in SCRIPTS
+        ]
     elif what == "timed":
         often += ["--eval-trials", "100"]
         jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
