@@ -127,6 +127,20 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
     return args, checkpoint
 
 
+def fingerprint(agent: nn.Module) -> torch.Tensor:
+    """Actions (3, 16, act_dim) at three fixed batches of observations, one after the other.
+
+    Two networks that read the same weights in different ways have different fingerprints.
+    """
+    rng, state, actions = np.random.default_rng(0), None, []
+    mean, deviation = agent.obs_mean.cpu().numpy(), agent.obs_var.sqrt().cpu().numpy()
+    for _ in range(3):
+        obs = mean + deviation * rng.standard_normal((16, len(mean)))
+        action, state = agent.predict(obs, state)
+        actions.append(action)
+    return torch.as_tensor(np.array(actions))
+
+
 class Run:
     """What a training leaves on disk, and what can stop it.
 
@@ -240,6 +254,7 @@ class Run:
         args = asdict(self.args) | {"resume": None}
         policy = {"algorithm": self.algorithm, "task": self.task, "args": args}
         policy |= {"weights": acting, "global_step": iteration * self.batch_size}
+        policy |= {"script": Path(sys.argv[0]).name, "fingerprint": fingerprint(self.agent)}
         state = {"weights": weights, "optimizer": self.optimizer.state_dict()}
         state |= {"iteration": iteration, "final_scores": self.final_scores}
         # A kill or a full disk leaves the old files whole.

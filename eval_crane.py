@@ -11,6 +11,8 @@ always the same trial. Intervals are 95 % Wilson score intervals.
 """
 
 import csv
+import importlib
+import importlib.util
 import json
 import os
 import sys
@@ -21,6 +23,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import imageio
@@ -59,8 +62,9 @@ CRANES = 200  # simulated at once
 class Args:
     path: Annotated[Path, tyro.conf.Positional] = SHIPPED
     """a run's folder or a policy.pt"""
-    policy: Literal["file", "scripted", "zero", "random"] = "file"
-    """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions"""
+    policy: str = "file"
+    """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions;
+    my_module:MyPolicy: your own, where MyPolicy()(obs) gives actions"""
     env_id: str | None = None
     """task to judge on; unset: the one the policy was trained on"""
     contact: Literal["primitive", "sdf"] | None = None
@@ -96,6 +100,24 @@ class Args:
         crane_options.check(vars(self), Args)
 
 
+def script_of(saved: dict[str, Any], path: Path) -> ModuleType:
+    """The script that wrote a policy.pt: one of the four, or an edited copy in this folder."""
+    name, algorithm = Path(saved.get("script", "")).name, saved["algorithm"]
+    for folder in (Path.cwd(), Path(__file__).parent):
+        file = folder / name
+        if file.suffix == ".py" and file.is_file() and "class Agent" in file.read_text():
+            spec = importlib.util.spec_from_file_location(file.stem, file)
+            script = importlib.util.module_from_spec(spec)
+            sys.modules[file.stem] = script  # where dataclasses look for it
+            spec.loader.exec_module(script)
+            return script
+    if algorithm not in ALGORITHMS:
+        wanted = f"; its script {name} is not in this folder" if name else ""
+        known = ", ".join(ALGORITHMS)
+        raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {known}{wanted}")
+    return ALGORITHMS[algorithm]
+
+
 def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     """The agent in a policy.pt, the task it was trained on, its algorithm. SystemExit if damaged.
 
@@ -110,22 +132,23 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         weights, args = saved["weights"], dict(saved["args"])
     except Exception:  # a damaged file raises many kinds
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
-    if algorithm not in ALGORITHMS:
-        raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {', '.join(ALGORITHMS)}")
+    script = script_of(saved, path)
     if "frame_skip" not in task:
         raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
     task = crane_options.DEFAULTS | task  # older files do not know all options
     if task["revision"] != crane_env.REVISION:
         print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
-    script = ALGORITHMS[algorithm]
     try:
-        obs_dim, bound = len(weights["obs_mean"]), np.ones(6)
-        agent = script.Agent(obs_dim, -bound, bound, script.Args(**args))
+        low, high = weights["action_low"].numpy(), weights["action_high"].numpy()
+        agent = script.Agent(len(weights["obs_mean"]), low, high, script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
     except Exception as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
         raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
+    known = saved.get("fingerprint")
+    if known is not None and not torch.allclose(crane_runs.fingerprint(agent), known, atol=1e-3):
+        raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than its own did")
     return agent, task, algorithm
 
 
@@ -137,6 +160,28 @@ class FixedPolicy:
 
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True):
         return self.scale * self.rng.uniform(-1, 1, (len(obs), 6)), None
+
+
+class OwnPolicy:
+    """A user's policy as `run_trials` wants it. make() gives a function from obs to actions."""
+
+    def __init__(self, name: str):
+        module, _, attribute = name.partition(":")
+        sys.path.insert(0, os.getcwd())
+        try:
+            self.make = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise SystemExit(f"--policy {name}: {error}") from None
+        self.name = name
+
+    def predict(self, obs: np.ndarray, state: Any, deterministic: bool = True):
+        """state: the user's object, new for each batch of trials."""
+        policy = self.make() if state is None else state
+        actions = np.asarray(policy(obs))
+        if actions.shape != (len(obs), 6):
+            wanted = f"({len(obs)}, 6) for observations {obs.shape}"
+            raise SystemExit(f"--policy {self.name}: actions {actions.shape}, not {wanted}")
+        return actions, policy
 
 
 def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -332,8 +377,13 @@ def show(policy: Any, env_id: str, options: dict, args: Args) -> None:
 
 def check_combinations(args: Args) -> None:
     """SystemExit that names arguments that do not fit together or a file that cannot be written."""
+    known = ("file", "scripted", "zero", "random")
     from_file, wrong_use = args.policy == "file", "goes with --policy file only"
     for wrong, message in [
+        (
+            args.policy not in known and ":" not in args.policy,
+            f"--policy must be {', '.join(known)} or my_module:MyPolicy, got {args.policy!r}",
+        ),
         (not args.diameters, "--diameters needs at least one number"),
         (not from_file and args.path != SHIPPED, f"PATH {wrong_use}"),
         (not from_file and args.stochastic, f"--stochastic {wrong_use}"),
@@ -376,6 +426,8 @@ def main() -> None:
     if args.policy == "file":
         policy, task, name = load_policy(args.path)
         source = str(args.path)
+    elif ":" in args.policy:
+        policy, name, source = OwnPolicy(args.policy), "mine", args.policy
     else:
         policy = FixedPolicy(args.policy, args.seed)
         name = source = args.policy

@@ -117,9 +117,7 @@ def main() -> None:
         row |= {key: f"{row[key]:.4g}" for key in ("rollout", "update", "SPS")}
         print("  ".join(f"{key} {value}" for key, value in row.items()))
     print(f"seconds: a {a:.2e}, b {b:.2e}, c {c:.2e}, d {d:.2e}")
-    print(
-        f"{4 * parameters} bytes of gradient; all-reduce {gradient:.2e} s, a number {scalar:.2e}"
-    )
+    print(f"{4 * parameters} bytes of gradient; all-reduce {gradient:.2e} s, a number {scalar:.2e}")
     with open(HERE / "scaling.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -401,6 +402,54 @@ def test_clear_errors_of_damaged_policies(tmp_path, capsys):
     torch.save(saved | {"task": saved["task"] | {"revision": -1}}, path)
     eval_crane.load_policy(path)
     assert "was trained on task revision -1" in capsys.readouterr().err
+
+
+def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, monkeypatch, run_here):
+    copy = tmp_path / "my_ppo_crane.py"
+    copy.write_text((ROOT / "ppo_crane.py").read_text().replace("nn.Tanh()", "nn.ReLU()"))
+    line = "--num-envs 2 --num-steps 8 --minibatch-size 8 --total-timesteps 16 --eval-every 0"
+    command = [sys.executable, str(copy), *line.split(), "--final-trials", "0"]
+    paths = {**os.environ, "PYTHONPATH": str(ROOT)}
+    subprocess.run(command, cwd=tmp_path, env=paths, check=True, capture_output=True)
+    (path,) = tmp_path.glob("runs/*/policy.pt")
+    monkeypatch.chdir(tmp_path)
+    agent, _, algorithm = eval_crane.load_policy(path)
+    assert isinstance(agent.actor[1], torch.nn.ReLU) and algorithm == "ppo"
+    assert "| 0.8 " in run_here(path, "--trials", "1", "--pose-noise", "none").out
+    copy.rename(tmp_path / "gone.py")
+    with pytest.raises(SystemExit, match="ppo_crane.py acts otherwise than its own did"):
+        eval_crane.load_policy(path)
+    torch.save(torch.load(path, weights_only=True) | {"algorithm": "my_ppo"}, path)
+    with pytest.raises(SystemExit, match="its script my_ppo_crane.py is not in this folder"):
+        eval_crane.load_policy(path)
+
+
+def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
+    """It is made anew for each batch of trials, and may remember what it saw in that batch."""
+    (tmp_path / "my_module.py").write_text(
+        "import numpy as np\n"
+        "class Counter:\n"
+        "    made = 0\n"
+        "    def __init__(self): self.steps, Counter.made = 0, Counter.made + 1\n"
+        "    def __call__(self, obs):\n"
+        "        self.steps += 1\n"
+        "        assert self.steps <= 90\n"
+        "        return np.zeros((len(obs), 6))\n"
+        "def wide(): return lambda obs: np.zeros((len(obs), 7))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(eval_crane, "CRANES", 4)
+    out = run_here("--policy", "my_module:Counter", "--trials", "1", "--pose-noise", "none").out
+    assert "mine (my_module:Counter)" in out
+    assert sys.modules["my_module"].Counter.made == 2  # six trials, four at a time
+    for policy, said in [
+        ("my_module:wide", r"actions \(4, 7\), not \(4, 6\) for observations \(4, 18\)"),
+        ("my_module:nothing", "--policy my_module:nothing: .*nothing"),
+        ("no_module:Policy", "--policy no_module:Policy: No module named 'no_module'"),
+        ("scripetd", "--policy must be file, scripted, zero, random or my_module:MyPolicy"),
+    ]:
+        with pytest.raises(SystemExit, match=said):
+            run_here("--policy", policy, "--trials", "1")
 
 
 @pytest.mark.parametrize("policy", ["file", "zero"])
