@@ -1,7 +1,8 @@
-"""A training run: its folder, TensorBoard, evaluations, signals, stop and resume. No learning.
+"""A training run: its folder, TensorBoard, evaluations, signals, stop and resume.
 
-The training scripts call it in this order: `read_arguments`, `Run(...)`, `run.iterations()`, after
-each update `run.finish_update(...)`, and `run.finish()`. eval_crane.py uses `one_line_errors`.
+This module has no learning. The training scripts call it in this order: `read_arguments`,
+`Run(...)`, `run.iterations()`, after each update `run.finish_update(...)`, and `run.finish()`.
+eval_crane.py uses `one_line_errors`.
 """
 
 import io
@@ -17,6 +18,7 @@ from typing import Any, TextIO
 
 import numpy as np
 import torch
+import torch.distributed as dist
 import tyro
 from filelock import FileLock, Timeout
 from gymnasium.vector import VectorEnv
@@ -30,6 +32,7 @@ import crane_trials
 from crane_options import DEFAULTS
 
 MAX_BATCH = 2**20  # decisions of a rollout, all in memory
+# With --resume a run takes other values of these, of env only the same.
 CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads", "env"}
 SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
 LOCKS: list[FileLock] = []  # of the folders in which this process trains
@@ -99,6 +102,23 @@ def read_arguments(algorithm: str, arguments: type, description: str) -> tuple[A
     return args, checkpoint
 
 
+def share_arguments(algorithm: str, arguments: type, description: str) -> tuple[Any, dict | None]:
+    """What rank 0 gets from `read_arguments`, on all ranks. If it exits, the others do so too."""
+    one_line_errors()
+    shared: list[Any] = [None]
+    if dist.get_rank() == 0:
+        try:
+            shared = [read_arguments(algorithm, arguments, description)]
+        except SystemExit as error:
+            code = error.code if isinstance(error.code, int | None) else 1
+            dist.broadcast_object_list([code])
+            raise
+    dist.broadcast_object_list(shared)
+    if not isinstance(shared[0], tuple):  # rank 0 has said why
+        raise SystemExit(shared[0])
+    return shared[0]
+
+
 def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any, dict]:
     """The arguments of a run, with those of the command line, and checkpoint.pt in its folder."""
     path = folder / "checkpoint.pt"
@@ -127,15 +147,13 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
     return args, checkpoint
 
 
-def fingerprint(agent: nn.Module) -> torch.Tensor:
+def fingerprint(agent: nn.Module, obs_dim: int) -> torch.Tensor:
     """Actions (3, 16, act_dim) at three fixed batches of observations, one after the other.
 
     Two networks that read the same weights in different ways have different fingerprints.
     """
-    rng, state, actions = np.random.default_rng(0), None, []
-    mean, deviation = agent.obs_mean.cpu().numpy(), agent.obs_var.sqrt().cpu().numpy()
-    for _ in range(3):
-        obs = mean + deviation * rng.standard_normal((16, len(mean)))
+    state, actions = None, []
+    for obs in np.random.default_rng(0).standard_normal((3, 16, obs_dim)):
         action, state = agent.predict(obs, state)
         actions.append(action)
     return torch.as_tensor(np.array(actions))
@@ -164,6 +182,9 @@ class Run:
     ):
         self.algorithm, self.args, self.rank = algorithm, args, rank
         self.agent, self.optimizer = agent, optimizer
+        actions = envs.single_action_space
+        self.spaces = {"obs_dim": envs.single_observation_space.shape[0]}
+        self.spaces |= {"low": torch.as_tensor(actions.low), "high": torch.as_tensor(actions.high)}
         self.batch_size = args.num_envs * args.num_steps
         self.num_iterations = max(1, args.total_timesteps // self.batch_size)
         done = 0 if checkpoint is None else checkpoint["iteration"]
@@ -186,7 +207,6 @@ class Run:
             self.writer = SummaryWriter(self.dir, purge_step=done * self.batch_size + 1)
             lines = [f"    {name}: {value}" for name, value in asdict(args).items()]
             self.writer.add_text("hyperparameters", "\n".join(lines))
-            print(f"writing to {self.dir}", flush=True)
         on_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
         self.task = {"env_id": args.env_id, **(envs.unwrapped.task if on_crane else {})}
 
@@ -196,6 +216,8 @@ class Run:
         for signum, handler in self.handlers.items():
             if handler != signal.SIG_IGN:  # nohup ignores some
                 signal.signal(signum, self.stop_after_update)
+        if rank == 0:
+            print(f"writing to {self.dir}", flush=True)
 
     def stop_after_update(self, signum: int, frame: object) -> None:
         """Ctrl-C, kill or a closed terminal: finish the update. A second Ctrl-C: stop at once."""
@@ -213,8 +235,13 @@ class Run:
         self.bar = tqdm(remaining, **count, disable=self.rank > 0)
         return self.bar
 
-    def finish_update(self, iteration: int, report: dict[str, float]) -> None:
-        """Write the report. Evaluate and save when it is time to, and stop if a signal came."""
+    def finish_update(
+        self, iteration: int, report: dict[str, float], stop: bool | None = None
+    ) -> None:
+        """Write the report. Evaluate and save when it is time to, and stop if a signal came.
+
+        stop: whether a signal came to any rank, where the ranks have agreed on it.
+        """
         args, last = self.args, iteration == self.num_iterations
         wrong = [name for name, value in report.items() if not np.isfinite(value)]
         if wrong or not all(tensor.isfinite().all() for tensor in self.agent.state_dict().values()):
@@ -227,14 +254,14 @@ class Run:
                 self.writer.add_scalar(key, value, iteration * self.batch_size)
             if args.eval_every and (iteration % args.eval_every == 0 or last):
                 self.evaluate("eval", args.eval_trials, iteration)
-        stopping = bool(self.stop_signals)
+        stopping = bool(self.stop_signals) if stop is None else stop
         if self.rank == 0 and (iteration % 10 == 0 or last or stopping):
             self.save(iteration)
         if stopping:
             self.bar.close()
             if self.rank == 0:
                 say(f"stopped after update {iteration}; go on with --resume {self.dir}")
-            raise SystemExit(128 + self.stop_signals[0])
+            raise SystemExit(128 + [*self.stop_signals, signal.SIGTERM][0])
         self.bar.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
     def evaluate(self, name: str, trials: int, iteration: int) -> dict[str, float]:
@@ -254,7 +281,8 @@ class Run:
         args = asdict(self.args) | {"resume": None}
         policy = {"algorithm": self.algorithm, "task": self.task, "args": args}
         policy |= {"weights": acting, "global_step": iteration * self.batch_size}
-        policy |= {"script": Path(sys.argv[0]).name, "fingerprint": fingerprint(self.agent)}
+        policy |= {"script": Path(sys.argv[0]).name, "spaces": self.spaces}
+        policy["fingerprint"] = fingerprint(self.agent, self.spaces["obs_dim"])
         state = {"weights": weights, "optimizer": self.optimizer.state_dict()}
         state |= {"iteration": iteration, "final_scores": self.final_scores}
         # A kill or a full disk leaves the old files whole.

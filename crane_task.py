@@ -40,7 +40,7 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 30.0  # r_ground at GENTLE_FORCE; none at half of it, three times at twice of it
+GROUND_WEIGHT = 30.0  # r_ground at GENTLE_FORCE; 0 at half of it, 3 times it at twice that
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]

@@ -17,16 +17,12 @@ import json
 import os
 import sys
 import tempfile
-import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
 
-import imageio
 import numpy as np
 import torch
 import tyro
@@ -35,9 +31,7 @@ from tqdm import tqdm
 import crane_env
 import crane_options
 import crane_runs
-import crane_task
 import crane_trials
-import machine
 import mppo_beta_crane
 import ppo_crane
 import recurrent_ppo_crane
@@ -45,6 +39,7 @@ import trpo_crane
 from crane_options import Range, Seed, Threads
 from crane_task import CONDITIONS, D_MAX, D_MIN, DIAMETERS
 from crane_trials import make_envs, monte_carlo_trials, run_trials
+from crane_view import film, show, whole_file
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
@@ -139,16 +134,20 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     if task["revision"] != crane_env.REVISION:
         print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
     try:
-        low, high = weights["action_low"].numpy(), weights["action_high"].numpy()
-        agent = script.Agent(len(weights["obs_mean"]), low, high, script.Args(**args))
+        bound = torch.ones(6)  # older files do not know their spaces, but all are the crane's
+        older = {"obs_dim": len(weights["obs_mean"]), "low": -bound, "high": bound}
+        obs_dim, low, high = (saved.get("spaces", older)[name] for name in older)
+        agent = script.Agent(obs_dim, low.numpy(), high.numpy(), script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
     except Exception as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
         raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
-    known = saved.get("fingerprint")
-    if known is not None and not torch.allclose(crane_runs.fingerprint(agent), known, atol=1e-3):
-        raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than its own did")
+    if "fingerprint" in saved:
+        actions = crane_runs.fingerprint(agent, obs_dim)
+        if not torch.allclose(actions, saved["fingerprint"], atol=1e-3):
+            wrote = f"that of {saved['script']}, which wrote it"
+            raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
     return agent, task, algorithm
 
 
@@ -312,67 +311,6 @@ def print_care(records: list[dict], cells: list[dict]) -> None:
     print("Gentle is success without more than 20 kN of the crane on the ground. Peak is that")
     print("force. Up is the time until the log is safely up. All but gentle are medians, up over")
     print("the successes.")
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A path to write to, which becomes `path` once all is written. An error leaves nothing."""
-    path = path.resolve()
-    unfinished = path.with_name(f"unfinished_{path.name}")
-    try:
-        yield unfinished
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def film(policy: Any, env_id: str, options: dict, args: Args) -> None:
-    """One trial per diameter, 20 frames a second. A frame is also taken halfway through a decision
-    of 0.1 s.
-    """
-    size = {"width": args.width, "height": args.width * 9 // 32 * 2}
-    scene = options | size | {"render_mode": "rgb_array", "camera": args.camera}
-    skip = make_envs(env_id, 1, **options).unwrapped.frame_skip
-    substeps = 2 if skip % 20 == 0 else 1
-    scene["frame_skip"] = skip // substeps
-    frame_every = max(1, round(10 / scene["frame_skip"]))
-    fps = round(1 / (frame_every * scene["frame_skip"] * machine.TIMESTEP))
-    gif = args.video.suffix.lower() == ".gif"
-    how = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
-    diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
-    frames = round(crane_task.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
-    bar, mean = tqdm(total=frames, unit="frame", leave=False), not args.stochastic
-    with whole_file(args.video) as path, bar, imageio.get_writer(path, **how) as video:
-        for diameter, seed in zip(diameters, seeds):
-            crane = make_envs(env_id, 1, diameter=diameter, **scene).unwrapped
-            obs, _ = crane.reset(seed=[seed])
-            state, ended, step = None, False, 0
-            while not ended:
-                if step % substeps == 0:
-                    actions, state = policy.predict(obs, state, deterministic=mean)
-                obs, _, terminated, truncated, _ = crane.advance(actions)
-                if step % frame_every == 0:
-                    video.append_data(crane.render()[0])
-                    bar.update()
-                ended, step = terminated[0] or truncated[0], step + 1
-            crane.close()
-    print(f"{len(seeds)} trials filmed in {args.video}")
-
-
-def show(policy: Any, env_id: str, options: dict, args: Args) -> None:
-    """Trials in a window, in real time, until it is closed. Diameters are drawn."""
-    crane = make_envs(env_id, 1, render_mode="human", **options).unwrapped
-    obs, _ = crane.reset(seed=args.seed)
-    state = None
-    while crane.viewer.is_running():
-        start = time.time()
-        actions, state = policy.predict(obs, state, deterministic=not args.stochastic)
-        obs, _, terminated, truncated, info = crane.step(actions)
-        if terminated[0] or truncated[0]:
-            print("success" if info["success"][0] else f"failed: {info['termination'][0]}")
-            state = None
-        time.sleep(max(0.0, crane.dt - (time.time() - start)))
-    crane.close()
 
 
 def check_combinations(args: Args) -> None:

@@ -21,7 +21,8 @@ SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telesco
     ),
     "mjcf": np.array([[-1.57, -1.57, -1.57, -2, -3, -3], [1.57, 1.57, 1.57, 2, 3, 3]]),
 }
-# The engine's joints: q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. Our q1 ... q8 are
+# The engine's joints are q1 q2 q3 q4 q4_stage2 q5 q6 q7 q8 q8_inner, then the log. JOINTS are the
+# indices of our q1 ... q8 among them.
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
 SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]

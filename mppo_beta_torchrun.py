@@ -1,16 +1,15 @@
 """mPPO on several processes: data-parallel with torch.distributed, on one machine or on many.
 
 This is mppo_beta_crane.py, except that each rank has a share of the cranes and of each minibatch:
---num-envs and --minibatch-size count those of all ranks. The ranks average their gradients, the
-statistics of the advantages, the KL divergence that stops an update, and, after each rollout, those
-of the observations. So all have the same weights. Rank 0 evaluates, and writes what it has seen.
+--num-envs and --minibatch-size count those of all ranks. The ranks average their gradients, the KL
+divergence that stops an update, and the statistics of advantages and observations. So all have the
+same weights. Rank 0 evaluates, and writes what it has seen.
 Several machines, and what to expect of 8, 64 and 512 cores: docs/speed.md.
 
     torchrun --standalone --nproc-per-node 2 mppo_beta_torchrun.py
 """
 
 import os
-import signal
 import time
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
@@ -185,8 +184,8 @@ def average(x: Tensor) -> Tensor:
     """The mean over all ranks of x, which is overwritten. SystemExit if a rank is gone."""
     try:
         dist.all_reduce(x)
-    except RuntimeError:
-        raise SystemExit("another rank is gone; go on with --resume") from None
+    except RuntimeError as error:
+        raise SystemExit(f"another rank is gone; go on with --resume ({error!s:.60})") from None
     return x / dist.get_world_size()
 
 
@@ -196,13 +195,13 @@ if __name__ == "__main__":
         raise SystemExit(f"start it as: torchrun --standalone --nproc-per-node 2 {__file__}")
     dist.init_process_group()
     rank, world_size = dist.get_rank(), dist.get_world_size()
-    shared = [*crane_runs.read_arguments(ALGORITHM, Args, __doc__)] if rank == 0 else [None] * 2
-    dist.broadcast_object_list(shared)
-    total, checkpoint = shared
-    if total.num_envs % world_size or total.minibatch_size % world_size:
+    all_args, checkpoint = crane_runs.share_arguments(ALGORITHM, Args, __doc__)
+    if all_args.num_envs % world_size or all_args.minibatch_size % world_size:
         raise SystemExit(f"--num-envs and --minibatch-size must be multiples of {world_size} ranks")
-    args = replace(total, num_envs=total.num_envs // world_size)
+    args = replace(all_args, num_envs=all_args.num_envs // world_size)  # this rank's share
     args.minibatch_size //= world_size
+    if args.device == "cuda":
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
     if 1 in (args.minibatch_size, batch_size % args.minibatch_size):
@@ -229,8 +228,10 @@ if __name__ == "__main__":
     torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    run = crane_runs.Run(ALGORITHM, total, envs, agent, optimizer, checkpoint, rank)
-    seeds = np.random.SeedSequence(run.env_seed).generate_state(total.num_envs)
+    run = crane_runs.Run(ALGORITHM, all_args, envs, agent, optimizer, checkpoint, rank)
+    for weights in agent.state_dict().values():
+        dist.broadcast(weights, 0)  # another CPU may round them otherwise
+    seeds = np.random.SeedSequence(run.env_seed).generate_state(all_args.num_envs)
     seeds = np.split(seeds, world_size)[rank].tolist()
     torch.manual_seed(seeds[0])  # from now on each rank samples for itself
 
@@ -279,8 +280,6 @@ if __name__ == "__main__":
                 with torch.no_grad():
                     rewards[step, cut] += gamma * agent.get_value(final_obs)
 
-        agent.update_normalizer(torch.cat(raw_obs))  # once, so that no rank waits in the rollout
-
         # Advantages
         update_start = time.time()
         torch.set_num_threads(args.torch_threads)
@@ -289,6 +288,7 @@ if __name__ == "__main__":
             values = agent.get_value(b_obs).view_as(rewards)
             b_logprobs = agent.get_distribution(b_obs).log_prob(b_actions).sum(-1)
             next_value = agent.get_value(agent.normalize(next_obs))
+            agent.update_normalizer(torch.cat(raw_obs))  # no rank waits for others in a rollout
         advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda**tenths)
         b_advantages, b_returns = advantages.flatten(), (advantages + values).flatten()
 
@@ -346,9 +346,8 @@ if __name__ == "__main__":
         report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
         report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
-        if average(torch.tensor(float(len(run.stop_signals)), device=device)) > 0:
-            run.stop_signals.append(signal.SIGTERM)  # perhaps another rank's
-        run.finish_update(iteration, report)
+        stop = average(torch.tensor(float(len(run.stop_signals)), device=device)) > 0
+        run.finish_update(iteration, report, bool(stop))
 
     dist.destroy_process_group()
     run.finish()

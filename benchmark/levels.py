@@ -36,6 +36,7 @@ import crane_env
 import crane_options
 import crane_runs
 import crane_trials
+import crane_view
 import eval_crane
 import machine
 from crane_env import CraneVectorEnv
@@ -74,12 +75,12 @@ def policy_of(method: str, level: str, seed: int = 1) -> tuple[Any, dict[str, An
             return None
         return ScriptedCrane(settings=settings[level]), {"sensors": False}
     script = METHODS[method]
-    name = f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
-    shipped = POLICIES / f"{script}{'' if level == 'ideal' else f'_{level}'}.pt"
-    for path in [*HERE.glob(f"runs/*__{name}__{seed}__*/policy.pt"), shipped]:
-        if path != shipped or (seed == 1 and path.is_file()):
+    folder, run = ("curves", script) if level == "ideal" else ("levels", f"{script}_{level}")
+    if (HERE / folder / f"{run}_seed{seed}.csv").exists():  # finished
+        for path in sorted(HERE.glob(f"runs/*__{folder}_{run}__{seed}__*/policy.pt")):
             return eval_crane.load_policy(path)[:2]
-    return None
+    shipped = POLICIES / f"{script if level == 'ideal' else run}.pt"
+    return eval_crane.load_policy(shipped)[:2] if seed == 1 and shipped.is_file() else None
 
 
 def judge(
@@ -152,7 +153,7 @@ def append(path: Path, jobs: list[dict], measure: Callable) -> None:
         if results is None:
             continue
         rows.append(job | {name: f"{value:.4g}" for name, value in results.items()})
-        with eval_crane.whole_file(path) as part, open(part, "w", newline="") as file:
+        with crane_view.whole_file(path) as part, open(part, "w", newline="") as file:
             writer = csv.DictWriter(file, rows[0].keys())
             writer.writeheader()
             writer.writerows(rows)

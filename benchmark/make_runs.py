@@ -1,10 +1,10 @@
 """Make the training runs behind the figures.
 
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
-    python benchmark/make_runs.py levels      # the same on the two harder levels; 6 hours
+    python benchmark/make_runs.py levels      # the same on the two harder levels; 12 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
     python benchmark/make_runs.py timed       # mPPO, three seeds, one at a time; half an hour
-    python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of all but the ablations
+    python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of `curves` and `timed`
 
 Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
 

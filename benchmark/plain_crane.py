@@ -23,8 +23,9 @@ import machine
 class PlainCrane(gymnasium.Env):
     """One crane with plain MuJoCo calls: scalars, and views that are looked up once.
 
-    The task is ForestryCrane-v0 with its defaults. Two things are left out: `info`, and the clip of
-    the observation to its space. No observation of an episode that goes on needs the clip.
+    The task is ForestryCrane-v0 with its defaults. Left out are `info`, the terms of the reward
+    that need forces (`carried`, r_ground, CLOSING_HEIGHT), and the clip of the observation to its
+    space. No observation of an episode that goes on needs the clip.
     """
 
     def __init__(self, frame_skip: int = 20):

@@ -111,7 +111,7 @@ def main() -> None:
     rows += [
         {"what": "model, 10 Gbit/s", **predict(ranks, n, NETWORK)}
         for ranks in (8, 64, 512)
-        for n in (8, 64)
+        for n in (8, 32)
     ]
     for row in rows:
         row |= {key: f"{row[key]:.4g}" for key in ("rollout", "update", "SPS")}

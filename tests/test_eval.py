@@ -417,7 +417,9 @@ def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, mon
     assert isinstance(agent.actor[1], torch.nn.ReLU) and algorithm == "ppo"
     assert "| 0.8 " in run_here(path, "--trials", "1", "--pose-noise", "none").out
     copy.rename(tmp_path / "gone.py")
-    with pytest.raises(SystemExit, match="ppo_crane.py acts otherwise than its own did"):
+    with pytest.raises(
+        SystemExit, match="/ppo_crane.py acts otherwise than that of my_ppo_crane.py"
+    ):
         eval_crane.load_policy(path)
     torch.save(torch.load(path, weights_only=True) | {"algorithm": "my_ppo"}, path)
     with pytest.raises(SystemExit, match="its script my_ppo_crane.py is not in this folder"):

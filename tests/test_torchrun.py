@@ -90,11 +90,10 @@ def test_a_killed_rank_ends_the_run_and_any_number_of_ranks_goes_on(tmp_path):
     assert SCRIPT.name not in "".join(re.findall(r'File "(.*)"', errors))  # no traceback of ours
     folder = only_run(tmp_path)
     done = torch.load(folder / "checkpoint.pt", weights_only=True)["iteration"]
-    for ranks in (1, 4):
-        done += 1
-        line = [SCRIPT, "--resume", folder, "--total-timesteps", 64 * done]
-        result = torchrun(tmp_path, *line, ranks=ranks)
-        assert result.returncode == 0, result.stderr[-2000:]
+    line = [SCRIPT, "--resume", folder, "--total-timesteps", 64 * (done + 1)]
+    result = torchrun(tmp_path, *line, ranks=1)
+    assert result.returncode == 0, result.stderr[-2000:]
+    done += 1
     assert scalars(folder)["charts/updates"] == list(range(1, done + 1))
 
 
@@ -117,22 +116,27 @@ def test_two_machines_train_together(tmp_path):
     assert only_run(tmp_path)
 
 
-def test_a_signal_to_one_rank_stops_all_with_the_update_saved(tmp_path):
-    arguments = [PROGRAM, tmp_path, "sampled", *SHORT, "--total-timesteps", "64000"]
+@pytest.mark.parametrize("target", ["a rank", "torchrun"])
+def test_a_signal_stops_all_ranks_with_the_update_saved(tmp_path, target):
+    arguments = [SCRIPT, *SHORT, "--total-timesteps", "64000", "--eval-every", "1"]
     process = torchrun(tmp_path, *arguments, start=subprocess.Popen)
-    first, second = children(process, tmp_path)
-    os.kill(second, signal.SIGTERM)
+    _, second = children(process, tmp_path)
+    os.kill(process.pid if target == "torchrun" else second, signal.SIGTERM)
     output, errors = process.communicate(timeout=60)
     assert "stopped after update" in output and "another rank is gone" not in errors
     done = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)["iteration"]
     assert f"stopped after update {done}; go on with --resume" in output
 
 
+def test_help_needs_no_other_rank(tmp_path):
+    result = torchrun(tmp_path, SCRIPT, "--help")
+    assert result.returncode == 0 and result.stdout.count("usage: ") == 1
+
+
 @pytest.mark.parametrize(
     ("ranks", "arguments", "said"),
     [
         (2, ["--num-envs", "5"], "must be multiples of 2 ranks"),
-        (2, ["--minibatch-size", "2"], "--minibatch-size leaves a single decision"),
         (None, [], "start it as: torchrun --standalone --nproc-per-node 2"),
     ],
 )
@@ -143,5 +147,5 @@ def test_what_cannot_work_is_said_in_a_line(tmp_path, ranks, arguments, said):
     else:
         result = torchrun(tmp_path, SCRIPT, *arguments, ranks=ranks)
     assert result.returncode == 1 and said in result.stderr
-    assert SCRIPT.name not in "".join(re.findall(r'File "(.*)"', result.stderr))
+    assert "crane_" not in "".join(re.findall(r'File "(.*)"', result.stderr))
     assert not (tmp_path / "runs").exists()
