@@ -23,9 +23,8 @@ import machine
 class PlainCrane(gymnasium.Env):
     """One crane with plain MuJoCo calls: scalars, and views that are looked up once.
 
-    The task is ForestryCrane-v0 with its defaults. Left out are `info`, the terms of the reward
-    that need forces (`carried`, r_ground, CLOSING_HEIGHT), and the clip of the observation to its
-    space. No observation of an episode that goes on needs the clip.
+    The task is ForestryCrane-v0 with its defaults. Two things are left out: `info`, and the clip of
+    the observation to its space. No observation of an episode that goes on needs the clip.
     """
 
     def __init__(self, frame_skip: int = 20):
@@ -34,6 +33,8 @@ class PlainCrane(gymnasium.Env):
         self.frame_skip, self.dt = frame_skip, frame_skip * machine.TIMESTEP
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
         self.sensordata, self.warnings = data.sensordata, data.warning
+        begin = model.sensor_historyadr[-1] + 7  # as in crane_env.py
+        self.ground_force = data.history[begin : begin + 15]
         self.q_at = machine.JOINTS
         self.dq_at = [machine.JOINTS[i] for i in machine.ACTUATED]
         _, integrators = np.split(model.actuator_gainprm, 2)  # after the velocity actuators
@@ -75,11 +76,13 @@ class PlainCrane(gymnasium.Env):
         load = data.qfrc_bias[machine.SERVOS]
         self.act[:] = self.qpos[machine.SERVOS] + load / self.kp
         self.diameter, self.decisions, self.reached = float(diameter), 0, False
+        self.weight, self.hit = 9.81 * mass, 0.0
         return self._observe([0.0] * 6)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         model, data = self.model, self.data
         command = self._command(action)
+        self.hit = 0.0
         due = self.decisions % max(1, crane_env.ANTI_WINDUP // self.frame_skip) == 0
         for start in range(0, self.frame_skip, crane_env.ANTI_WINDUP):
             if due:
@@ -90,6 +93,7 @@ class PlainCrane(gymnasium.Env):
                 nstep -= 1
             if nstep > 0:
                 mujoco.mj_step(model, data, nstep)
+            self._look_for_hits()
         mujoco.mj_step1(model, data)
         self.decisions += 1
         now = self.decisions * self.dt
@@ -122,6 +126,11 @@ class PlainCrane(gymnasium.Env):
             for a, (i, lead) in zip(self.act.tolist(), self.servos)
         ]
 
+    def _look_for_hits(self) -> None:
+        force = self.ground_force.tolist()
+        for i in range(0, 15, 3):
+            self.hit = max(self.hit, hypot(*force[i : i + 3]))
+
     def _within_limits(self, q: list[float], dq: list[float]) -> bool:
         return all(low <= x <= high for x, (low, high) in zip(q, self.limits)) and all(
             2 * low <= v <= 2 * high for v, (low, high) in zip(dq, self.speeds)
@@ -142,20 +151,28 @@ class PlainCrane(gymnasium.Env):
         if abs(rotator) > crane_task.ROTATOR_MAX:
             angle += copysign(pi, rotator)
         z += (crane_task.D_MAX - self.diameter) / 2
-        d_combine = sqrt(x * x + y * y + z * z) + 1.0 - min(abs(dot), 1.0)
+        away = 1.0 - min(abs(dot), 1.0)
+        d_combine = sqrt(x * x + y * y + z * z) + away
+        aim = sqrt(x * x + y * y + (z + crane_task.CLOSING_HEIGHT) ** 2) + away
 
         up = min(abs(uz), 1.0)
         clearance = lz - crane_task.LOG_LENGTH / 2 * up - self.diameter / 2 * sqrt(1 - up * up)
-        beyond = crane_task.NEAR_SHARPNESS * (d_combine - crane_task.REACH_DISTANCE)
+        beyond = crane_task.NEAR_SHARPNESS * (aim - crane_task.REACH_DISTANCE)
         grasp = min(1.0, exp(-beyond)) * exp(-((miss / crane_task.GRAPPLE_MISS) ** 2))
         clearance = max(clearance, 1e-9)
         height = sqrt(min(clearance, 1 / clearance))
-        lift = exp(-((miss / crane_task.LIFT_MISS) ** 2)) * height
-        reward = exp(-crane_task.OMEGA2 * d_combine) + crane_task.LIFT_WEIGHT * lift
+        centred = exp(-((miss / crane_task.LIFT_MISS) ** 2))
+        lift = centred * height
+        reward = exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
+        hardness = min(max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0), 3.0)
+        reward -= crane_task.GROUND_WEIGHT * hardness
         reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if touch[0] > 0 and touch[1] > 0:
             calm = 1 - tanh(hypot(*command[:5]))
             reward += crane_task.BALANCE_WEIGHT * calm * lift
+            on_ground = hypot(*touch[2:5]) + hypot(*touch[5:8])
+            carried = min(max(1 - on_ground / self.weight, 0.0), 1.0)
+            reward += crane_task.CARRY_WEIGHT * centred * carried
         cos_q1, sin_q1 = cos(q[0]), sin(q[0])
         x, y = cos_q1 * x + sin_q1 * y, cos_q1 * y - sin_q1 * x
         return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
@@ -178,6 +195,10 @@ class NumpyCrane(PlainCrane):
         position = self.qpos[machine.SERVOS]
         self.act[:] = np.clip(self.act, position - self.lead, position + self.lead)
 
+    def _look_for_hits(self) -> None:
+        force = np.linalg.norm(self.ground_force.reshape(5, 3), axis=-1)
+        self.hit = np.maximum(self.hit, force.max())
+
     def _within_limits(self, q: np.ndarray, dq: np.ndarray) -> bool:
         low, high = self.limits
         q = q[crane_task.LIMITED]
@@ -197,20 +218,29 @@ class NumpyCrane(PlainCrane):
         if np.abs(rotator) > crane_task.ROTATOR_MAX:
             angle += np.pi * np.sign(rotator)
         delta_p[2] += (crane_task.D_MAX - self.diameter) / 2
-        d_combine = np.linalg.norm(delta_p) + 1.0 - np.minimum(np.abs(dot), 1.0)
+        away = 1.0 - np.minimum(np.abs(dot), 1.0)
+        d_combine = np.linalg.norm(delta_p) + away
+        aim = np.linalg.norm(delta_p + [0, 0, crane_task.CLOSING_HEIGHT]) + away
 
         up = np.minimum(np.abs(log_axis[2]), 1.0)
         below = crane_task.LOG_LENGTH / 2 * up + self.diameter / 2 * np.sqrt(1 - up**2)
         clearance = np.maximum(log_centre[2] - below, 1e-9)
-        beyond = crane_task.NEAR_SHARPNESS * (d_combine - crane_task.REACH_DISTANCE)
+        beyond = crane_task.NEAR_SHARPNESS * (aim - crane_task.REACH_DISTANCE)
         grasp = np.minimum(1.0, np.exp(-beyond)) * np.exp(-((miss / crane_task.GRAPPLE_MISS) ** 2))
         height = np.sqrt(np.minimum(clearance, 1 / clearance))
-        lift = np.exp(-((miss / crane_task.LIFT_MISS) ** 2)) * height
-        reward = np.exp(-crane_task.OMEGA2 * d_combine) + crane_task.LIFT_WEIGHT * lift
+        centred = np.exp(-((miss / crane_task.LIFT_MISS) ** 2))
+        lift = centred * height
+        reward = np.exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
+        hardness = np.clip(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0, 3)
+        reward -= crane_task.GROUND_WEIGHT * hardness
         reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if np.all(self.sensordata[12:14] > 0):
             calm = 1 - np.tanh(np.linalg.norm(command[:5]))
             reward += crane_task.BALANCE_WEIGHT * calm * lift
+            support, pressure = self.sensordata[14:20].reshape(2, 3)
+            on_ground = np.linalg.norm(support) + np.linalg.norm(pressure)
+            carried = np.clip(1 - on_ground / self.weight, 0, 1)
+            reward += crane_task.CARRY_WEIGHT * centred * carried
         c, s = np.cos(q[0]), np.sin(q[0])
         along = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ delta_p
         obs = np.concatenate([q, dq, along, [angle]]).astype(np.float32)
