@@ -56,7 +56,7 @@ CRANES = 200  # simulated at once
 @dataclass
 class Args:
     path: Annotated[Path, tyro.conf.Positional] = SHIPPED
-    """a run's folder or a policy.pt"""
+    """a run's folder or a policy.pt, a model of Stable-Baselines3 (.zip), or an .onnx file"""
     policy: str = "file"
     """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions;
     my_module:MyPolicy: your own, where MyPolicy()(obs) gives actions"""
@@ -116,11 +116,17 @@ def script_of(saved: dict[str, Any], path: Path) -> ModuleType:
 def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     """The agent in a policy.pt, the task it was trained on, its algorithm. SystemExit if damaged.
 
-    The task is `env_id`, `revision` and all options of the environment.
+    The task is `env_id`, `revision` and all options of the environment. A model of
+    Stable-Baselines3 does not know its options.
     """
     path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
         raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
+    if path.suffix == ".zip":
+        return load_sb3(path), {"env_id": "ForestryCrane-v0"}, "Stable-Baselines3"
+    if path.suffix == ".onnx":
+        policy = OnnxPolicy(path)
+        return policy, policy.task, policy.algorithm
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         algorithm, task = saved["algorithm"], dict(saved["task"])
@@ -149,6 +155,43 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
             wrote = f"that of {saved['script']}, which wrote it"
             raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
     return agent, task, algorithm
+
+
+def load_sb3(path: Path) -> Any:
+    """The policy in a model of Stable-Baselines3 or sb3-contrib. It needs that library."""
+    try:
+        from stable_baselines3.common.save_util import load_from_zip_file
+
+        data, weights, _ = load_from_zip_file(path)
+        spaces = data["observation_space"], data["action_space"]
+        policy = data["policy_class"](*spaces, lambda _: 0.0, **data["policy_kwargs"])
+        policy.load_state_dict(weights["policy"])
+    except Exception as error:  # a missing library, a damaged file, a model of another version
+        raise SystemExit(f"{path}: {error}") from None
+    policy.set_training_mode(False)
+    return policy
+
+
+class OnnxPolicy:
+    """What export_onnx.py wrote."""
+
+    def __init__(self, path: Path):
+        try:
+            import onnxruntime
+
+            self.session = onnxruntime.InferenceSession(path)
+            known = self.session.get_modelmeta().custom_metadata_map
+            self.task, self.algorithm = json.loads(known["task"]), known["algorithm"]
+        except Exception as error:
+            raise SystemExit(f"{path} is no file of export_onnx.py: {error}") from None
+        self.memory = self.session.get_inputs()[1:]
+
+    def predict(self, obs: np.ndarray, state: list | None, deterministic: bool = True):
+        """Actions (N, 6) and the memory after them. An .onnx file has the mean action only."""
+        state = state or [np.zeros((len(obs), i.shape[1]), np.float32) for i in self.memory]
+        inputs = {i.name: part for i, part in zip(self.memory, state)}
+        actions, *state = self.session.run(None, {"obs": np.float32(obs), **inputs})
+        return actions, state
 
 
 class FixedPolicy:
@@ -194,12 +237,12 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
         raise SystemExit(f"--env-id {env_id} is not the crane")
     names = trained_on.keys() & crane_options.DEFAULTS.keys() - {"difficulty", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
-    if args.policy == "file":
+    if "sensors" in trained_on:
         options["sensors"] = trained_on["sensors"]  # what its networks read
     options |= {"contact": args.contact} if args.contact else {}
     if args.policy == "scripted":
         options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}
-    elif args.env_id and args.policy == "file":
+    elif args.env_id and "sensors" in trained_on:
         envs = make_envs(env_id, 1, **options)
         for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed"):
             ours, theirs = envs.unwrapped.options[name], trained_on[name]
@@ -370,8 +413,12 @@ def main() -> None:
         policy = FixedPolicy(args.policy, args.seed)
         name = source = args.policy
     env_id, options = task_of(args, task)
-    all_options = make_envs(env_id, 1, **options).unwrapped.options
+    crane = make_envs(env_id, 1, **options).unwrapped
+    all_options = crane.options
     contact = all_options["contact"]
+    observed, wanted = crane.single_observation_space, getattr(policy, "observation_space", None)
+    if wanted is not None and wanted.shape != observed.shape:  # of Stable-Baselines3
+        raise SystemExit(f"{source} observes {wanted.shape}; {env_id} gives {observed.shape}")
     if args.policy == "scripted":
         settings = HYDRAULIC if all_options["actuators"] == "hydraulic" else IDEAL
         policy = ScriptedCrane(args.signed_yaw, settings)

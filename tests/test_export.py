@@ -1,0 +1,81 @@
+"""export_onnx.py, and models of Stable-Baselines3, as eval_crane.py judges them."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import onnxruntime
+import pytest
+import stable_baselines3
+from script_runs import ALGORITHMS, ROOT
+
+import eval_crane
+import export_onnx
+from crane_trials import evaluate
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_onnx_file_acts_as_the_policy(tmp_path, algorithm):
+    """In turn, with the memory of an LSTM, for another number of cranes than at the export."""
+    path = ROOT / "assets" / "policies" / f"{algorithm}_crane.pt"
+    export_onnx.main(path, tmp_path / "policy.onnx")
+    agent, task, _ = eval_crane.load_policy(path)
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    memory = {i.name: np.zeros((7, i.shape[1]), "f4") for i in session.get_inputs()[1:]}
+    assert len(memory) == (2 if algorithm == "recurrent_ppo" else 0)
+    judged, judged_task, name = eval_crane.load_policy(tmp_path / "policy.onnx")
+    assert (judged_task, name) == (task, algorithm)
+    rng, state, judged_state = np.random.default_rng(0), None, None
+    for _ in range(5):
+        obs = rng.normal(size=(7, 18))
+        actions, *after = session.run(None, {"obs": obs.astype("f4"), **memory})
+        memory = dict(zip(memory, after))
+        expected, state = agent.predict(obs, state)
+        np.testing.assert_allclose(actions, expected, rtol=1e-6, atol=1e-6)
+        again, judged_state = judged.predict(obs, judged_state)
+        np.testing.assert_array_equal(again, actions)
+    assert np.ptp(expected) > 0.1
+
+
+def test_the_onnx_file_lifts_logs(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    export_onnx.main(eval_crane.SHIPPED, tmp_path / "policy.onnx")
+    line = ["eval_crane.py", "policy.onnx", "--trials", "2", "--pose-noise", "none"]
+    monkeypatch.setattr(sys, "argv", line)
+    eval_crane.main()
+    (mean,) = re.findall(r"\| mean  \| 96.3    \| ([0-9.]+)", capsys.readouterr().out)
+    assert float(mean) > 80
+
+
+def test_the_command_writes_a_file(tmp_path):
+    line = [sys.executable, ROOT / "export_onnx.py", eval_crane.SHIPPED, tmp_path / "a.onnx"]
+    result = subprocess.run(line, capture_output=True, text=True)
+    assert result.returncode == 0 and "mppo_beta written to" in result.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+
+
+@pytest.mark.parametrize("name", ["PPO", "SAC"])
+def test_a_model_of_stable_baselines3_is_judged(tmp_path, monkeypatch, name):
+    import crane_env  # noqa: F401  registers the tasks
+
+    monkeypatch.chdir(tmp_path)
+    model = getattr(stable_baselines3, name)("MlpPolicy", "ForestryCrane-v0", seed=1)
+    model.save("model.zip")
+    policy, task, _ = eval_crane.load_policy(tmp_path / "model.zip")
+    ours = evaluate(policy, task["env_id"], 1, 40_000)
+    assert ours == evaluate(model, "ForestryCrane-v0", 1, 40_000)
+    line = ["eval_crane.py", "model.zip", "--env-id", "ForestryCraneHydraulic-v0"]
+    monkeypatch.setattr(sys, "argv", line)
+    with pytest.raises(
+        SystemExit, match=r"observes \(18,\); ForestryCraneHydraulic-v0 gives \(32,\)"
+    ):
+        eval_crane.main()
+
+
+@pytest.mark.parametrize("kind", ["zip", "onnx"])
+def test_damaged_files_are_named(tmp_path, kind):
+    path = tmp_path / f"policy.{kind}"
+    path.write_bytes(b"junk")
+    with pytest.raises(SystemExit, match=f"policy.{kind}"):
+        eval_crane.load_policy(path)
