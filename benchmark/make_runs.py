@@ -30,7 +30,7 @@ from tyro.conf import Positional
 HERE = Path(__file__).parent
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
 LEVELS = {  # flags by name
-    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 2048000",
+    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 1536000",
     "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000",
 }
 SHORT = "--total-timesteps 614400 --eval-every 10".split()

@@ -267,6 +267,34 @@ MUTATIONS = [
         "            pass\n",
         "test_hydraulics -k costs",
     ),
+    Mutation(
+        "ranks keep gradients of their own",
+        ("mppo_beta_torchrun.py",),
+        "nn.utils.vector_to_parameters(average(nn.utils.parameters_to_vector(grads)), grads)",
+        "pass",
+        "test_torchrun -k gradient or weights",
+    ),
+    Mutation(
+        "ranks keep statistics of their own",
+        ("mppo_beta_torchrun.py",),
+        "adv = adv - average(adv.mean())",
+        "adv = adv - adv.mean()",
+        "test_torchrun -k gradient",
+    ),
+    Mutation(
+        "ranks normalize by their own observations",
+        ("mppo_beta_torchrun.py",),
+        "mean = average(obs.mean(0))",
+        "mean = obs.mean(0)",
+        "test_torchrun -k gradient",
+    ),
+    Mutation(
+        "a changed network is judged as if it were not",
+        ("eval_crane.py",),
+        'if not torch.allclose(actions, saved["fingerprint"], atol=1e-3):',
+        "if False:",
+        "test_eval -k edited",
+    ),
 ]
 
 
