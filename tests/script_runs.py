@@ -11,6 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 ROOT = Path(__file__).parent.parent
 ALGORITHMS = ["mppo_beta", "ppo", "trpo", "recurrent_ppo"]
+TWO = ["mppo_beta", "trpo"]  # for what crane_runs.py does in the same way for all
 SMALL = "--num-envs 4 --num-steps 16 --update-epochs 2 --hidden-sizes 16 16 --eval-trials 1"
 SMALL = [*SMALL.split(), "--final-trials", "0", "--env-threads", "1", "--torch-threads", "1"]
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from filelock import FileLock
-from script_runs import ALGORITHMS, command, environment, module, only_run, run, scalars, small
+from script_runs import ALGORITHMS, TWO, command, environment, module, only_run, run, scalars, small
 
 import crane_env
 import crane_options
@@ -148,7 +148,7 @@ def test_runs_is_no_folder(tmp_path, algorithm):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TWO)
 def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_afterwards(
     tmp_path, run_here, algorithm
 ):
@@ -258,7 +258,7 @@ class Harmful:
         return os.mkdir, ("code ran",)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TWO)
 def test_no_code_of_a_checkpoint_runs(tmp_path, run_here, algorithm):
     task = {"env_id": "ForestryCrane-v0", "revision": crane_env.REVISION, **crane_options.DEFAULTS}
     saved = {"algorithm": algorithm, "task": task, "args": vars(module(algorithm).Args())}
@@ -275,7 +275,7 @@ def test_no_code_of_a_checkpoint_runs(tmp_path, run_here, algorithm):
 # ---- resume
 
 
-@pytest.fixture(params=ALGORITHMS)
+@pytest.fixture(params=TWO)
 def finished(request, tmp_path, run_here):
     """Algorithm and folder of a run of two updates."""
     arguments = [*small(request.param), *ECHO, "--total-timesteps", "128", "--eval-every", "1"]
@@ -373,7 +373,7 @@ def test_a_second_resume_of_the_same_run_is_refused(finished, run_here):
         assert ended(line, run_dir) == (1, [f"another process trains in {run_dir}"])
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TWO)
 def test_an_interrupted_evaluation_is_made_on_resume(tmp_path, run_here, monkeypatch, algorithm):
     """A kill in the evaluation of update 15, and one in the final trials."""
     evaluate, calls = crane_trials.evaluate, []

@@ -14,6 +14,7 @@ import torch
 from script_runs import (
     ALGORITHMS,
     ROOT,
+    TWO,
     command,
     environment,
     make_agent,
@@ -397,7 +398,7 @@ def outcome(process):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TWO)
 def test_a_signal_in_the_final_trials_ends_the_run(tmp_path, algorithm):
     process = start(algorithm, tmp_path, "--total-timesteps", "64", "--final-trials", "300")
     time.sleep(2)  # 1,800 trials take much longer
@@ -510,7 +511,7 @@ def test_a_second_ctrl_c_stops_at_once_and_nohup_is_respected(tmp_path):
     assert process.returncode == -signal.SIGINT
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TWO)
 def test_a_stop_during_an_evaluation_keeps_the_update(
     tmp_path, monkeypatch, run_here, capsys, algorithm
 ):
