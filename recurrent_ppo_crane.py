@@ -231,6 +231,7 @@ if __name__ == "__main__":
     torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    # With --resume it loads weights and optimizer. From here on Ctrl-C waits for the update.
     run = crane_runs.Run(ALGORITHM, args, envs, agent, optimizer, checkpoint)
 
     def set_difficulty(iteration: int) -> None:
