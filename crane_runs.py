@@ -85,7 +85,8 @@ def lock_folder(folder: Path) -> None:
 def read_arguments(algorithm: str, arguments: type, description: str) -> tuple[Any, dict | None]:
     """Args of the command line, and the checkpoint that --resume names, if any.
 
-    SystemExit says what is wrong with them. arguments: the script's dataclass `Args`. description: its docstring.
+    SystemExit says what is wrong with them. arguments: the script's dataclass `Args`.
+    description: its docstring.
     """
     one_line_errors()
     args, checkpoint = tyro.cli(arguments, description=description.partition("\n\n")[0]), None
