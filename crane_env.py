@@ -506,13 +506,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         delta_p, delta_psi, signed_angle = crane_task.relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
         clearance, miss = crane_task.log_clearance(state), crane_task.centre_miss(state)
-        kind = self.options["reward"]
+        kind, actuators = self.options["reward"], self.options["actuators"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
         above = 0.0 if kind == "paper" else crane_task.CLOSING_HEIGHT
         distance = np.linalg.norm(delta_p + [0, 0, above], axis=-1) + delta_psi
-        terms = crane_task.reward_terms(
-            state, distance, clearance, miss, command, self.hit, self.difficulty, kind
-        )
+        given = state, distance, clearance, miss, command, self.hit, self.difficulty
+        terms = crane_task.reward_terms(*given, kind, actuators)
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
         if self.options["randomize"]:
             info |= {f"drawn_{name}": values.copy() for name, values in self.drawn.items()}

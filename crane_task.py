@@ -40,7 +40,8 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 30.0  # r_ground at GENTLE_FORCE; 0 at half of it, 3 times it at twice that
+GROUND_WEIGHT = 30.0  # what r_ground takes away at GENTLE_FORCE, from nothing at half of it
+GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}  # times that at most: stiff servos only hit hard
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]
@@ -162,6 +163,7 @@ def reward_terms(
     ground: Array,
     difficulty: float = 1.0,
     kind: str = "staged",
+    actuators: str = "ideal",
 ) -> Array:
     """The TERMS of the reward, which is their sum, (5, N).
 
@@ -193,7 +195,7 @@ def reward_terms(
         centred = np.exp(-((miss / LIFT_MISS) ** 2))
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
-        hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, 3)
+        hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, GROUND_MOST[actuators])
         r_ground = -GROUND_WEIGHT * difficulty**2 * hardness
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 

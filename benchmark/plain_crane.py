@@ -164,7 +164,7 @@ class PlainCrane(gymnasium.Env):
         centred = exp(-((miss / crane_task.LIFT_MISS) ** 2))
         lift = centred * height
         reward = exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
-        hardness = min(max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0), 3.0)
+        hardness = min(max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0), 1.0)
         reward -= crane_task.GROUND_WEIGHT * hardness
         reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if touch[0] > 0 and touch[1] > 0:
@@ -231,7 +231,7 @@ class NumpyCrane(PlainCrane):
         centred = np.exp(-((miss / crane_task.LIFT_MISS) ** 2))
         lift = centred * height
         reward = np.exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
-        hardness = np.clip(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0, 3)
+        hardness = np.clip(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0, 1)
         reward -= crane_task.GROUND_WEIGHT * hardness
         reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if np.all(self.sensordata[12:14] > 0):

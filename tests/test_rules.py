@@ -152,9 +152,12 @@ def test_carrying_the_log_pays_before_it_rises():
 
 
 def test_hitting_the_ground_costs():
-    """From 10 to 40 kN, less in an easy task; nothing in the paper's form."""
+    """From 10 to 20 kN, with hydraulic drives to 40; less in an easy task, nothing on paper."""
     here = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1])
     for force, expected in [(0, 0), (10e3, 0), (15e3, -15), (20e3, -30), (40e3, -90), (50e3, -90)]:
+        terms = terms_of(here, 0.4, COMMAND, ground=np.array([force]), actuators="hydraulic")
+        assert terms[4] == pytest.approx(expected)
+        expected = max(expected, -30)
         terms = terms_of(here, 0.4, COMMAND, ground=np.array([force]))
         assert terms[4] == pytest.approx(expected)
         easy = terms_of(here, 0.4, COMMAND, ground=np.array([force]), difficulty=0.5)
