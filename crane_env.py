@@ -122,7 +122,6 @@ HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.e
 REVISION = 7  # of the task; raise it when a change makes trained policies worse
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
 
-
 COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 CARE = ["gentle", *COSTS, "time_up", "log_speed"]
 Array = np.ndarray
@@ -135,7 +134,8 @@ ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`.
 
-    Crane i's starts depend on the seed, on i and, with retry, on its failures; not on N or threads.
+    Crane i's starts depend on the seed, on i and, with retry, on its failures. They do not depend
+    on N or on the threads.
 
     `info` describes the step just made, for every crane, also one whose episode just ended:
     `termination` (one of TERMINATIONS, or "none"), the reward's TERMS, `d_combine`, `clearance`,
@@ -198,7 +198,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.difficulty = options["difficulty"]
         self.dt = self.frame_skip * TIMESTEP  # s, one decision
         self.max_decisions = int(np.ceil(crane_task.TIME_LIMIT / self.dt - 1e-9))
-        # with both its ends
+        # The hold begins and ends with a decision, and both count.
         self.hold_decisions = int(np.floor(crane_task.HOLD_TIME / self.dt + 1e-9)) + 1
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
         self.metadata["autoreset_mode"] = self.autoreset_mode

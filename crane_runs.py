@@ -32,7 +32,7 @@ import crane_trials
 from crane_options import DEFAULTS
 
 MAX_BATCH = 2**20  # decisions of a rollout, all in memory
-# With --resume a run takes other values of these, of env only the same.
+# What --resume may change. Options in env may be repeated, but not changed.
 CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads", "env"}
 SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
 LOCKS: list[FileLock] = []  # of the folders in which this process trains
