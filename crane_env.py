@@ -87,34 +87,12 @@ from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch, SimulationError
 from numpy.random import Generator, SeedSequence, default_rng
 
+import crane_options
 import crane_task
-from crane_options import (
-    HYDRAULIC,
-    PAPER,
-    RANDOMIZED,
-    Options,
-    Range,
-    Size,
-    Threads,
-    check,
-    complete,
-)
+import machine
+from crane_options import Options, Range, Size, Threads, check, complete
 from crane_task import CONDITIONS, D_MAX, D_MIN, GENTLE_FORCE, LOG_LENGTH, TERMS, CraneState
-from machine import (
-    ACTUATED,
-    COMMAND_OF_SERVO,
-    DRAWN,
-    JOINTS,
-    MAX_PRESSURE,
-    PASSIVE,
-    SERVOS,
-    SPEEDS,
-    TIMESTEP,
-    VALVE_STEPS,
-    Valves,
-    load_model,
-    oil_per_movement,
-)
+from machine import ACTUATED, COMMAND_OF_SERVO, COSTS, JOINTS, PASSIVE, SERVOS, SPEEDS, TIMESTEP
 
 # ---- constants
 
@@ -122,7 +100,6 @@ HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.e
 REVISION = 7  # of the task; raise it when a change makes trained policies worse
 ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
 
-COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 CARE = ["gentle", *COSTS, "time_up", "log_speed"]
 Array = np.ndarray
 ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
@@ -139,10 +116,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     `info` describes the step just made, for every crane, also one whose episode just ended:
     `termination` (one of TERMINATIONS, or "none"), the reward's TERMS, `d_combine`, `clearance`,
-    `centre_miss` (m), `time_to_reach` (s, inf before), and, where an episode ended, `success`,
-    the same as `is_success` for Stable-Baselines3, and which of CONDITIONS failed it. The mask
-    `_key` says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of
-    an episode.
+    `centre_miss` (m), `diameter` (m), `log_mass` (kg), `time_to_reach` (s, inf before), and, where
+    an episode ended, `success`, the same as `is_success` for Stable-Baselines3, and which of
+    CONDITIONS failed it. The mask `_key` says for which cranes `key` is meaningful. `final_obs` and
+    `final_info` hold the end of an episode.
 
     CARE says what the episode has cost so far: `ground_peak` (N), `ground_impulse` (N s) and
     `ground_time` (s above GENTLE_FORCE) of the crane's force on the ground, `litres` of oil,
@@ -204,7 +181,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata["autoreset_mode"] = self.autoreset_mode
 
         engine = (options[name] for name in ("contact", "integrator", "solver", "actuators"))
-        self.model = load_model(*engine, visual=render_mode is not None)
+        self.model = machine.load_model(*engine, visual=render_mode is not None)
         self.hydraulic = options["actuators"] == "hydraulic"
         self.batch = batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
         ALIVE.add(self)
@@ -229,12 +206,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.max_lead = self.model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp
         self.drawn = {
             name: np.tile(nominal, (self.num_envs, *[1] * np.ndim(nominal)))
-            for name, (nominal, _, _) in DRAWN.items()
+            for name, (nominal, _, _) in machine.DRAWN.items()
+            if self.hydraulic or name not in machine.OF_DRIVES
         }
 
-        self.valves = Valves(self.num_envs)
-        self.hit = np.zeros(self.num_envs)  # N, largest force on the ground in the last decision
-        self.costs = {name: np.zeros(self.num_envs) for name in COSTS}
+        self.valves = machine.Valves(self.num_envs)
+        self.costs = machine.Costs(self.num_envs)
         self.time_up = np.full(self.num_envs, np.inf)  # s
         self.decisions = np.zeros(self.num_envs, int)  # since the start of each episode
         self.reach_time = np.full(self.num_envs, np.inf)  # s
@@ -339,7 +316,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         failed = ~np.array([reached, *(self.streaks >= self.hold_decisions)])
         info |= dict(zip(CONDITIONS, failed)) | {"success": truncated & ~failed.any(axis=0)}
         info["is_success"] = info["success"]
-        info |= {name: cost.copy() for name, cost in self.costs.items()}
+        info |= {name: cost.copy() for name, cost in self.costs.total.items()}
         info["gentle"] = info["success"] & (info["ground_peak"] <= GENTLE_FORCE)
         info["time_up"] = self.time_up.copy()
         info["log_speed"] = np.linalg.norm(self.log_velocity[:, :3], axis=-1)
@@ -359,11 +336,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if not self.hydraulic:
             self.ctrl[:] = np.tile(command[:, COMMAND_OF_SERVO], 2)  # servos and their integrators
         failed = np.zeros(self.num_envs, bool)
-        self.hit[:] = 0.0
+        self.costs.impact[:] = 0.0
         # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
         # lead keeps squeezing the log at zero command, as a check valve does. If a decision is
         # shorter than a piece, only every k-th decision of an episode clamps the integrators.
-        piece = VALVE_STEPS if self.hydraulic else ANTI_WINDUP
+        piece = machine.VALVE_STEPS if self.hydraulic else ANTI_WINDUP
         every = max(1, piece // self.frame_skip)
         due = self.decisions % every == 0
         for start in range(0, self.frame_skip, piece):
@@ -389,27 +366,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
 
     def count_costs(self, seconds: float) -> None:
-        """Add to `costs` what the last piece of a decision took.
-
-        The ground's force is known at each physics step, all else at the last one. The pump gives
-        every joint its oil, at the pressure that the hardest of them needs.
-        """
+        """Add to `costs` what the last piece of a decision took."""
         ground = np.linalg.norm(self.ground_force.reshape(-1, 5, 3), axis=-1)
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
         force = self.drive_force[:, SERVOS] @ np.eye(6)[COMMAND_OF_SERVO]  # of both stages, jaws
-        oil = oil_per_movement(q, dq)
-        flow = np.sum(oil * np.abs(dq), axis=-1)
-        pressure = np.clip(force * np.sign(dq) / oil, 0, MAX_PRESSURE).max(axis=-1)
-        swing = np.hypot(q[:, 4] - np.pi / 2 + q[:, 1] + q[:, 2], q[:, 5] - np.pi / 2)
-        costs = self.costs
-        self.hit = np.maximum(self.hit, ground.max(axis=-1))
-        costs["ground_peak"] = np.maximum(costs["ground_peak"], self.hit)
-        costs["ground_impulse"] += ground.mean(axis=-1) * seconds
-        costs["ground_time"] += (ground > GENTLE_FORCE).mean(axis=-1) * seconds
-        costs["litres"] += 1000 * flow * seconds
-        costs["energy"] += flow * pressure * seconds
-        costs["work"] += np.sum(np.abs(force * dq), axis=-1) * seconds
-        costs["swing_peak"] = np.maximum(costs["swing_peak"], swing)
+        self.costs.add(ground, q, dq, force, seconds)
 
     def start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
         """New episodes in cranes `ids`; observations and info of all cranes."""
@@ -422,13 +383,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 self.starts[i] = crane_task.sample_start(start_rng)
             bound = crane_task.POSE_NOISE
             self.noise[i] = noise_rng.uniform(-bound, bound, self.noise[i].shape)
-            if share := self.options["randomize"]:
-                for name, (nominal, low, high) in DRAWN.items():
-                    if name in ("stiffness", "damping"):
-                        drawn = np.exp(machine_rng.uniform(np.log(low), np.log(high)))
-                    else:
-                        drawn = machine_rng.uniform(low, high)
-                    self.drawn[name][i] = nominal + share * (drawn - nominal)
+            if self.options["randomize"]:
+                drawn = machine.draw_machine(machine_rng, self.options["randomize"])
+                for name, values in self.drawn.items():
+                    values[i] = drawn[name]
         starts = [self.starts[i] for i in ids]
         if self.difficulty < 1:
             starts = [crane_task.ease_start(*start, self.difficulty) for start in starts]
@@ -470,8 +428,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.valves.close(ids)
         self.decisions[ids] = 0
         self.reach_time[ids] = self.time_up[ids] = np.inf
-        for cost in (self.hit, *self.costs.values()):
-            cost[ids] = 0.0
+        self.costs.clear(ids)
         self.streaks[:, ids] = 0
 
     def set_machine(self, ids: Array) -> None:
@@ -487,8 +444,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
         damping = self.drawn["damping"][ids][:, COMMAND_OF_SERVO]
         self.engine["dof_damping"][np.ix_(ids, SERVOS)] = damping
-        late = self.drawn["late"][ids, None]
-        self.engine["actuator_delay"][ids, 8:] = self.model.actuator_delay[8:] + late
+        delay = self.model.actuator_delay[8:] + self.drawn["extra_delay"][ids, None]
+        self.engine["actuator_delay"][ids, 8:] = delay
 
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
@@ -508,9 +465,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         clearance, miss = crane_task.log_clearance(state), crane_task.centre_miss(state)
         kind, actuators = self.options["reward"], self.options["actuators"]
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
+        info |= {"diameter": state.diameter, "log_mass": self.batch.body("log").mass[:, 0].copy()}
         above = 0.0 if kind == "paper" else crane_task.CLOSING_HEIGHT
         distance = np.linalg.norm(delta_p + [0, 0, above], axis=-1) + delta_psi
-        given = state, distance, clearance, miss, command, self.hit, self.difficulty
+        given = state, distance, clearance, miss, command, self.costs.impact, self.difficulty
         terms = crane_task.reward_terms(*given, kind, actuators)
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
         if self.options["randomize"]:
@@ -573,24 +531,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
-        if self.render_mode == "rgb_array":
-            if self.viewer is None:
-                self.viewer = mujoco.Renderer(self.batch.get_model(0), *self.frame_size)
-            frames = []
-            for i in range(self.num_envs):
-                self.batch.get_model(i, self.viewer.model)
-                self.viewer.update_scene(self.batch.get_data(i), self.camera)
-                frames.append(self.viewer.render())
-            return tuple(frames)
-        if self.render_mode == "human":
-            from mujoco import viewer  # needs a display's libraries
+        if self.render_mode is not None and self.viewer is None:
+            import crane_view  # needs libraries that nothing else does
 
-            if self.viewer is None:
-                self.viewer = viewer.launch_passive(self.batch.get_model(0), self.batch.get_data(0))
-            with self.viewer.lock():
-                self.batch.get_model(0, self.viewer.m)
-                self.batch.get_data(0, self.viewer.d)
-            self.viewer.sync()
+            kind = crane_view.Window if self.render_mode == "human" else crane_view.Photographer
+            self.viewer = kind(self)
+        return self.viewer and self.viewer.show()
 
     def close_extras(self, **kwargs: Any) -> None:
         if self.viewer is not None:
@@ -666,6 +612,6 @@ class CraneEnv(gymnasium.Env):
 
 CLASSES = {"entry_point": "crane_env:CraneEnv", "vector_entry_point": "crane_env:CraneVectorEnv"}
 gymnasium.register("ForestryCrane-v0", **CLASSES)
-gymnasium.register("ForestryCranePaper-v0", kwargs=PAPER, **CLASSES)
-gymnasium.register("ForestryCraneHydraulic-v0", kwargs=HYDRAULIC, **CLASSES)
-gymnasium.register("ForestryCraneRandomized-v0", kwargs=RANDOMIZED, **CLASSES)
+gymnasium.register("ForestryCranePaper-v0", kwargs=crane_options.PAPER, **CLASSES)
+gymnasium.register("ForestryCraneHydraulic-v0", kwargs=crane_options.HYDRAULIC, **CLASSES)
+gymnasium.register("ForestryCraneRandomized-v0", kwargs=crane_options.RANDOMIZED, **CLASSES)

@@ -13,6 +13,7 @@ always the same trial. Intervals are 95 % Wilson score intervals.
 import csv
 import importlib
 import importlib.util
+import inspect
 import json
 import os
 import sys
@@ -59,9 +60,9 @@ class Args:
     """a run's folder or a policy.pt, a model of Stable-Baselines3 (.zip), or an .onnx file"""
     policy: str = "file"
     """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions;
-    my_module:MyPolicy: your own, where MyPolicy()(obs) gives actions"""
+    my_module:MyPolicy: your own. MyPolicy()(obs) or MyPolicy().predict(obs, state) gives actions"""
     env_id: str | None = None
-    """task to judge on; unset: the one the policy was trained on"""
+    """task to judge on; unset: the one the policy was trained on, or ForestryCrane-v0"""
     contact: Literal["primitive", "sdf"] | None = None
     """contact model of jaws and log; unset: the task's"""
     signed_yaw: bool = True
@@ -85,8 +86,8 @@ class Args:
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     camera: Literal["overview", "side", "grapple"] = "overview"
-    """camera of the video"""
-    width: Annotated[int, Range(64, 1920)] = 1280
+    """camera of the film and of the window"""
+    width: Annotated[int, Range(64, 1920)] = 640
     """width of the video [pixels], even; the format is 16:9"""
     viewer: bool = False
     """show one trial after another in a window instead of judging"""
@@ -205,25 +206,37 @@ class FixedPolicy:
 
 
 class OwnPolicy:
-    """A user's policy as `run_trials` wants it. make() gives a function from obs to actions."""
+    """A user's policy as `run_trials` wants it.
+
+    make() gives a function from observations to actions, or an object with `predict` as
+    Stable-Baselines3 has it. Each batch of trials gets one of its own.
+    """
 
     def __init__(self, name: str):
         module, _, attribute = name.partition(":")
         sys.path.insert(0, os.getcwd())
         try:
             self.make = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise SystemExit(f"--policy {name}: {error}") from None
+            inspect.signature(self.make).bind()
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
+            wanted = f"{attribute or 'it'} must be a class or function without arguments"
+            raise SystemExit(f"--policy {name}: {error}; {wanted}") from None
         self.name = name
 
-    def predict(self, obs: np.ndarray, state: Any, deterministic: bool = True):
-        """state: the user's object, new for each batch of trials."""
-        policy = self.make() if state is None else state
-        actions = np.asarray(policy(obs))
-        if actions.shape != (len(obs), 6):
-            wanted = f"({len(obs)}, 6) for observations {obs.shape}"
+    def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True):
+        """state: the user's object and, if it has `predict`, its own state."""
+        policy, memory = (self.make(), None) if state is None else state
+        if hasattr(policy, "predict"):
+            actions, memory = policy.predict(obs, memory, deterministic=deterministic)
+        elif callable(policy):
+            actions = policy(obs)
+        else:
+            raise SystemExit(f"--policy {self.name}: {policy!r} is no function and has no predict")
+        actions = torch.as_tensor(actions).detach().numpy()
+        if actions.shape != (len(obs), 6) or not np.isfinite(actions).all():
+            wanted = f"({len(obs)}, 6) finite numbers for observations {obs.shape}"
             raise SystemExit(f"--policy {self.name}: actions {actions.shape}, not {wanted}")
-        return actions, policy
+        return actions, (policy, memory)
 
 
 def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -310,8 +323,8 @@ def summarize(records: list[dict]) -> list[dict]:
 def print_table(records: list[dict], cells: list[dict], paper: dict, title: str) -> None:
     """Success by diameter beside the paper's % by diameter, if it has any."""
     print(f"\n{title}")
-    print("| d [m] | paper % | ours % | 95 % interval | reach [s] | miss [m] | failures |")
-    print("|-------|---------|--------|---------------|-----------|----------|----------|")
+    print("| d [m] | paper % | success % | 95 % interval | reach [s] | miss [m] | failures |")
+    print("|-------|---------|-----------|---------------|-----------|----------|----------|")
     for cell in cells:
         good = [r for r in records if r["success"] and r["diameter"] == cell["diameter"]]
         published = paper.get(cell["diameter"], "")
@@ -320,14 +333,14 @@ def print_table(records: list[dict], cells: list[dict], paper: dict, title: str)
         low, high = (100 * bound for bound in cell["interval"])
         failures = ", ".join(f"{name} {count}" for name, count in cell["failures"].items())
         print(
-            f"| {cell['diameter']:<5} | {published:<7} | {100 * cell['success_rate']:<6.1f} "
+            f"| {cell['diameter']:<5} | {published:<7} | {100 * cell['success_rate']:<9.1f} "
             f"| {low:5.1f} - {high:5.1f} | {reach:<9} | {miss:<8} | {failures} |"
         )
     wins, trials = sum(c["successes"] for c in cells), sum(c["trials"] for c in cells)
     low, high = (100 * bound for bound in wilson_interval(wins, trials))
     published = [paper.get(cell["diameter"]) for cell in cells]
     mean = "" if None in published else f"{np.mean(published):.1f}"
-    print(f"| mean  | {mean:<7} | {100 * wins / trials:<6.1f} | {low:5.1f} - {high:5.1f} | | | |")
+    print(f"| mean  | {mean:<7} | {100 * wins / trials:<9.1f} | {low:5.1f} - {high:5.1f} | | | |")
     print("Reach is the mean time until d_combine < 0.35 m. Miss is the mean distance from grip to")
     print("log centre, along the log. Both are means over the successes.")
     print_care(records, cells)
@@ -426,7 +439,7 @@ def main() -> None:
     if args.video or args.viewer:
         torch.manual_seed(args.seed)
         options["pose_noise"] = args.pose_noise or "none"
-        return (film if args.video else show)(policy, env_id, options, args)
+        return (film if args.video else show)(policy, name, env_id, options, args)
 
     all_records = []
     noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]

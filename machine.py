@@ -11,6 +11,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from numpy import ndarray as Array
+from numpy.random import Generator
+
+import crane_world
+from crane_task import GENTLE_FORCE
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
 TIMESTEP = 0.005  # s, one physics step (paper, Sec. V)
@@ -60,7 +64,7 @@ DRAWN = {
         np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 2.7e3]),
         np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 4.3e3]),
     ),
-    "late": (0.0, -0.02, 0.02),  # s, more or less dead time of all joints
+    "extra_delay": (0.0, -0.02, 0.02),  # s, added to the dead time of all joints
     "gain": (  # factor on the speed, in the negative and the positive direction
         np.ones((2, 6)),
         np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
@@ -73,6 +77,8 @@ DRAWN = {
     "joint_error": (np.zeros(8), -0.0087 * (np.arange(8) != 3), 0.0087 * (np.arange(8) != 3)),
     "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
 }
+OF_DRIVES = {"stiffness", "damping", "extra_delay", "gain"}  # of DRAWN; the ideal crane has none
+COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 
 
 def load_model(
@@ -104,6 +110,8 @@ def load_model(
                 geom.conaffinity &= ~4
     if actuators == "hydraulic":
         install_drives(spec)
+    if visual:
+        crane_world.decorate(spec)
     spec.compiler.discardvisual = not visual
     return spec.compile()
 
@@ -152,16 +160,28 @@ def oil_per_movement(q: Array, dq: Array) -> Array:
     return oil
 
 
+def draw_machine(rng: Generator, share: float) -> dict[str, Array]:
+    """A machine, a log and sensors as DRAWN says. share 0 gives the nominal ones."""
+    machine = {}
+    for name, (nominal, low, high) in DRAWN.items():
+        if name in ("stiffness", "damping"):
+            drawn = np.exp(rng.uniform(np.log(low), np.log(high)))
+        else:
+            drawn = rng.uniform(low, high)
+        machine[name] = nominal + share * (drawn - nominal)
+    return machine
+
+
 class Valves:
     """Valves and pump of N cranes: from commanded speeds to the speeds that the oil gives."""
 
     def __init__(self, num_envs: int):
-        self.opening = np.zeros((num_envs, 6))  # rad/s, m/s, what the valves let through
+        self.speed = np.zeros((num_envs, 6))  # rad/s, m/s, that the valves let through
         self.telescope_wait = np.zeros(num_envs)  # s since a resting telescope was commanded
 
     def close(self, ids: Array) -> None:
         """Valves of cranes `ids` as in a crane at rest."""
-        self.opening[ids] = self.telescope_wait[ids] = 0
+        self.speed[ids] = self.telescope_wait[ids] = 0
 
     def mean_speed(self, ids: Array, command: Array, q: Array, seconds: float) -> Array:
         """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
@@ -170,14 +190,48 @@ class Valves:
         command as a first-order lag. A resting telescope's load-holding valve opens late. If all
         joints ask for more oil than the pump gives, all get the same share.
         """
-        opening, telescope = self.opening[ids], command[:, 3]
-        resting = (np.abs(opening[:, 3]) < 1e-3) & (np.abs(telescope) >= 1e-3)
+        speed, telescope = self.speed[ids], command[:, 3]
+        resting = (np.abs(speed[:, 3]) < 1e-3) & (np.abs(telescope) >= 1e-3)
         self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
         closed = resting & (self.telescope_wait[ids] <= BREAKAWAY)
         target = command.copy()
         target[closed, 3] = 0.0
         decay = np.exp(-seconds / LAG)
-        mean = target + (opening - target) * LAG / seconds * (1 - decay)
-        self.opening[ids] = target + (opening - target) * decay
+        mean = target + (speed - target) * LAG / seconds * (1 - decay)
+        self.speed[ids] = target + (speed - target) * decay
         demand = np.sum(oil_per_movement(q, mean) * np.abs(mean), axis=-1, keepdims=True)
         return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
+
+
+class Costs:
+    """What the episodes of N cranes have cost so far, and how hard the last decision hit."""
+
+    def __init__(self, num_envs: int):
+        self.total = {name: np.zeros(num_envs) for name in COSTS}
+        self.impact = np.zeros(num_envs)  # N, largest force on the ground in the last decision
+
+    def clear(self, ids: Array) -> None:
+        """New episodes of cranes `ids`."""
+        for cost in (self.impact, *self.total.values()):
+            cost[ids] = 0.0
+
+    def add(self, ground: Array, q: Array, dq: Array, force: Array, seconds: float) -> None:
+        """Add the costs of the last seconds.
+
+        ground (N, 5) in N at each of the last physics steps. All else is of the last one: q (N, 8),
+        dq (N, 6) and force (N, 6) of the drives, in rad, m, s, N m and N. The pump gives every
+        joint its oil, at the pressure that the hardest of them needs.
+        """
+        oil = oil_per_movement(q, dq)
+        flow = np.sum(oil * np.abs(dq), axis=-1)
+        pressure = np.clip(force * np.sign(dq) / oil, 0, MAX_PRESSURE).max(axis=-1)
+        swing = np.hypot(q[:, 4] - np.pi / 2 + q[:, 1] + q[:, 2], q[:, 5] - np.pi / 2)
+        self.impact = np.maximum(self.impact, ground.max(axis=-1))
+        total = self.total
+        total["ground_peak"] = np.maximum(total["ground_peak"], self.impact)
+        total["ground_impulse"] += ground.mean(axis=-1) * seconds
+        total["ground_time"] += (ground > GENTLE_FORCE).mean(axis=-1) * seconds
+        total["litres"] += 1000 * flow * seconds
+        total["energy"] += flow * pressure * seconds
+        total["work"] += np.sum(np.abs(force * dq), axis=-1) * seconds
+        total["swing_peak"] = np.maximum(total["swing_peak"], swing)

@@ -32,7 +32,6 @@ from mujoco import MjModel
 from tqdm import tqdm
 from tyro.conf import Positional
 
-import crane_env
 import crane_options
 import crane_runs
 import crane_trials
@@ -107,7 +106,7 @@ def judge(
 @contextmanager
 def changed(what: str, value: float) -> Iterator[None]:
     """The hydraulic crane with one thing changed, for cranes made here."""
-    load_model, start_episodes = crane_env.load_model, CraneVectorEnv.start_episodes
+    load_model, start_episodes = machine.load_model, CraneVectorEnv.start_episodes
     dead_time, max_delay, pump = machine.DEAD_TIME, machine.MAX_DELAY, machine.PUMP_FLOW
 
     def changed_model(*args: Any, **kwargs: Any) -> MjModel:
@@ -125,7 +124,7 @@ def changed(what: str, value: float) -> Iterator[None]:
         envs.drawn["pose_error"] = value * np.stack(error, axis=-1)
         return start_episodes(envs, ids)
 
-    crane_env.load_model = changed_model
+    machine.load_model = changed_model
     if what.startswith("more"):
         machine.DEAD_TIME, machine.MAX_DELAY = dead_time + value, 2 * max_delay
     if what.startswith("pump"):
@@ -135,7 +134,7 @@ def changed(what: str, value: float) -> Iterator[None]:
     try:
         yield
     finally:
-        crane_env.load_model, CraneVectorEnv.start_episodes = load_model, start_episodes
+        machine.load_model, CraneVectorEnv.start_episodes = load_model, start_episodes
         machine.DEAD_TIME, machine.MAX_DELAY, machine.PUMP_FLOW = dead_time, max_delay, pump
 
 

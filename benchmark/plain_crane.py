@@ -28,7 +28,7 @@ class PlainCrane(gymnasium.Env):
     """
 
     def __init__(self, frame_skip: int = 20):
-        self.model = model = crane_env.load_model(visual=False)
+        self.model = model = machine.load_model(visual=False)
         self.data = data = mujoco.MjData(model)
         self.frame_skip, self.dt = frame_skip, frame_skip * machine.TIMESTEP
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl

@@ -228,8 +228,8 @@ MUTATIONS = [
     Mutation(
         "valves have no lag",
         ("machine.py",),
-        "self.opening[ids] = target + (opening - target) * decay",
-        "self.opening[ids] = target",
+        "self.speed[ids] = target + (speed - target) * decay",
+        "self.speed[ids] = target",
         "test_hydraulics -k lag",
     ),
     Mutation(
@@ -262,7 +262,7 @@ MUTATIONS = [
     ),
     Mutation(
         "costs go on in the next episode",
-        ("crane_env.py",),
+        ("machine.py",),
         "            cost[ids] = 0.0\n",
         "            pass\n",
         "test_hydraulics -k costs",

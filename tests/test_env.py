@@ -34,7 +34,7 @@ def random_actions(rng, n):
 
 def needs_opengl():
     try:
-        mujoco.Renderer(crane_env.load_model(), 8, 8).close()
+        mujoco.Renderer(machine.load_model(), 8, 8).close()
     except Exception as error:
         pytest.skip(f"no OpenGL here: {error}")
 
@@ -101,7 +101,7 @@ def test_options_say_their_defaults():
 
 def test_columns_are_the_engines():
     """JOINTS and SERVOS are columns of qpos and of qvel; every servo has two actuators."""
-    model = crane_env.load_model()
+    model = machine.load_model()
     assert [model.joint(i).name for i in machine.JOINTS] == NAMES
     servos = "q1 q2 q3 q4 q4_stage2 q7 q8 q8_inner".split()
     assert [model.joint(i).name for i in machine.SERVOS] == servos
@@ -618,7 +618,7 @@ def test_info_has_masks_and_what_sb3_reads(monkeypatch):
     monkeypatch.setattr(crane_task, "REACH_TIME", 0.5)
     envs = DictInfoToList(CraneVectorEnv(3))
     _, infos = envs.reset(seed=0)
-    names = {"d_combine", "clearance", "centre_miss", *crane_task.TERMS}
+    names = {"d_combine", "clearance", "centre_miss", "diameter", "log_mass", *crane_task.TERMS}
     assert all(set(info) == names for info in infos)
     envs.env.reach_time[1] = 0.1
     of_ends = {"success", "is_success", *crane_task.CONDITIONS}

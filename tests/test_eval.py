@@ -21,6 +21,7 @@ import crane_options
 import crane_task
 import crane_trials
 import eval_crane
+import machine
 from eval_crane import Args, FixedPolicy, judge
 
 ROOT = Path(__file__).parent.parent
@@ -332,7 +333,7 @@ def test_same_trial_in_any_batch(monkeypatch):
 @pytest.mark.parametrize("kind", ["mp4", "gif"])
 def test_video(tmp_path, run_here, monkeypatch, kind):
     try:
-        mujoco.Renderer(crane_env.load_model(), 8, 8).close()
+        mujoco.Renderer(machine.load_model(), 8, 8).close()
     except Exception as error:
         pytest.skip(f"no OpenGL here: {error}")
     monkeypatch.setattr(crane_task, "REACH_TIME", 0.8)  # an idle crane fails then
@@ -429,7 +430,7 @@ def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, mon
 def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
     """It is made anew for each batch of trials, and may remember what it saw in that batch."""
     (tmp_path / "my_module.py").write_text(
-        "import numpy as np\n"
+        "import numpy as np, torch\n"
         "class Counter:\n"
         "    made = 0\n"
         "    def __init__(self): self.steps, Counter.made = 0, Counter.made + 1\n"
@@ -437,15 +438,25 @@ def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
         "        self.steps += 1\n"
         "        assert self.steps <= 90\n"
         "        return np.zeros((len(obs), 6))\n"
+        "class Model:\n"
+        "    def predict(self, obs, state, deterministic): return torch.zeros(len(obs), 6), 1\n"
         "def wide(): return lambda obs: np.zeros((len(obs), 7))\n"
+        "def lost(): return lambda obs: np.full((len(obs), 6), np.nan)\n"
+        "def needy(gain): pass\n"
+        "def dumb(): return 5\n"
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(eval_crane, "CRANES", 4)
     out = run_here("--policy", "my_module:Counter", "--trials", "1", "--pose-noise", "none").out
     assert "mine (my_module:Counter)" in out
     assert sys.modules["my_module"].Counter.made == 2  # six trials, four at a time
+    out = run_here("--policy", "my_module:Model", "--trials", "1", "--pose-noise", "none").out
+    assert "mine (my_module:Model)" in out
     for policy, said in [
-        ("my_module:wide", r"actions \(4, 7\), not \(4, 6\) for observations \(4, 18\)"),
+        ("my_module:lost", r"actions \(4, 6\), not \(4, 6\) finite numbers"),
+        ("my_module:needy", "missing a required argument: 'gain'; needy must be a class or"),
+        ("my_module:dumb", "5 is no function"),
+        ("my_module:wide", r"actions \(4, 7\), not \(4, 6\) finite numbers for observations"),
         ("my_module:nothing", "--policy my_module:nothing: .*nothing"),
         ("no_module:Policy", "--policy no_module:Policy: No module named 'no_module'"),
         ("scripetd", "--policy must be file, scripted, zero, random or my_module:MyPolicy"),

@@ -9,10 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-import crane_env
 import crane_task
 import machine
-from crane_env import CraneVectorEnv, load_model
+from crane_env import CraneVectorEnv
 from machine import COMMAND_OF_SERVO, JOINTS, SERVOS
 
 # theta, a, d, alpha of the Denavit-Hartenberg table in assets/README.md; q4 twice
@@ -66,7 +65,7 @@ def grasp_start():
 
 
 def test_forward_kinematics_is_the_dh_product():
-    model = load_model()
+    model = machine.load_model()
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     worst = 0.0
@@ -92,7 +91,7 @@ def test_forward_kinematics_is_the_dh_product():
 
 def test_known_pose_hangs_almost_straight():
     """A pose of the real crane: its passive joints hang within 4 degrees of straight down."""
-    model = load_model()
+    model = machine.load_model()
     data = mujoco.MjData(model)
     pose = dict(q1=-0.48, q2=0.736, q3=-0.303, q4=0.428, q4_stage2=0.428, q5=1.179, q6=1.525)
     for name, value in pose.items():
@@ -103,7 +102,7 @@ def test_known_pose_hangs_almost_straight():
 
 
 def test_tip_position_matches_the_model():
-    model = load_model()
+    model = machine.load_model()
     data = mujoco.MjData(model)
     for q2, q3, q4 in [(0.5, 0.2, 0.5), (-0.3, 1.1, 2.0), (1.2, -0.8, 0.0)]:
         for name, value in dict(q2=q2, q3=q3, q4=q4, q4_stage2=q4).items():
@@ -116,7 +115,7 @@ def test_tip_position_matches_the_model():
 
 def test_jaw_geometry():
     """Tips level and 2.38 m apart when open, straight down at pi/2, meeting at 1.98 rad."""
-    model = load_model()
+    model = machine.load_model()
     data = mujoco.MjData(model)
 
     def tips(q8):
@@ -138,7 +137,7 @@ def test_jaw_geometry():
 
 
 def test_moving_mass():
-    model = load_model()
+    model = machine.load_model()
     mass = model.body_subtreemass[model.body("base").id]
     assert abs(mass - 1985.28) < 0.01
     assert abs(mass / 1981 - 1) < 0.005  # the paper's "approximately 1981 kg"
@@ -148,14 +147,14 @@ def test_moving_mass():
 @pytest.mark.parametrize("joint", ["q5", "q6"])
 def test_small_swing_is_that_of_a_damped_compound_pendulum(joint, monkeypatch):
     """Its Coulomb friction aside, which holds it within friction / stiffness of its rest."""
-    load_model = crane_env.load_model
+    load_model = machine.load_model
 
     def without_friction(*args, **kwargs):
         model = load_model(*args, **kwargs)
         model.dof_frictionloss[:] = 0
         return model
 
-    monkeypatch.setattr(crane_env, "load_model", without_friction)
+    monkeypatch.setattr(machine, "load_model", without_friction)
     envs = place(HANGING, frame_skip=1)
     for _ in range(12_000):  # a minute, until it hangs still
         envs.advance(np.zeros((1, 6)))
@@ -197,7 +196,7 @@ def test_small_swing_is_that_of_a_damped_compound_pendulum(joint, monkeypatch):
     assert mass > 200
     assert abs(period / expected - 1) < 0.02
 
-    monkeypatch.setattr(crane_env, "load_model", load_model)
+    monkeypatch.setattr(machine, "load_model", load_model)
     envs = place(HANGING, frame_skip=1)
     friction = envs.model.dof_frictionloss[model.joint(joint).dofadr[0]] / stiffness
     assert 0.001 < friction < 0.01
@@ -352,7 +351,7 @@ def test_log_mass_and_inertia_follow_the_diameter():
 
 def closing_at_first_touch(diameter, contact):
     """q8 at which a jaw first touches a log fixed in the air 0.15 m below the grapple frame."""
-    model = load_model(contact)
+    model = machine.load_model(contact)
     data = mujoco.MjData(model)
     model.geom("log").size[0] = model.geom("log_capsule").size[0] = diameter / 2
     model.geom("log_capsule").size[1] = 2.75 / 2 - diameter / 2
@@ -499,8 +498,8 @@ def test_integrators_and_solvers_are_passed_on(integrator, solver):
 def test_both_contact_models_have_one_inertia_and_one_friction():
     frictions = []
     for contact, log in [("primitive", "log_capsule"), ("sdf", "log")]:
-        model = load_model(contact)
-        reference = load_model("primitive")
+        model = machine.load_model(contact)
+        reference = machine.load_model("primitive")
         np.testing.assert_array_equal(model.body_mass, reference.body_mass)
         np.testing.assert_array_equal(model.body_inertia, reference.body_inertia)
         for jaw in ("jaw_outer", "jaw_inner"):
@@ -515,7 +514,7 @@ def test_both_contact_models_have_one_inertia_and_one_friction():
 
 def test_bands_lie_side_by_side():
     """Along the hinge: outer bands from 0.105 to 0.19 m on either side, the inner one between."""
-    model = load_model("sdf")
+    model = machine.load_model("sdf")
     for jaw, bands in (("jaw_outer", {(-190, -105), (105, 190)}), ("jaw_inner", {(-100, 100)})):
         found = []
         for i in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_SDF):
