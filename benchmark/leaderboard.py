@@ -1,0 +1,106 @@
+"""The leaderboard: methods judged on frozen levels by docs/compare.md's protocol.
+
+    python benchmark/leaderboard.py check                       # judge every row again
+    python benchmark/leaderboard.py check --method mPPO         # the rows of one method
+    python benchmark/leaderboard.py add --method "My method" --level ideal --policy model.zip
+
+`add` judges a policy and writes its row to benchmark/leaderboard.csv. `check` judges the policies
+of the rows again. It fails if a score differs by more than TOLERANCE: policies of the same weights
+differ by a trial or two between processors, through rounding.
+"""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tqdm import tqdm
+from tyro.conf import Positional
+
+HERE = Path(__file__).parent
+BOARD = HERE / "leaderboard.csv"
+LEVELS = {
+    "ideal": "ForestryCrane-v0",
+    "hydraulic": "ForestryCraneHydraulic-v0",
+    "randomized": "ForestryCraneRandomized-v0",
+}
+NOISES = {"exact": "none", "pose_errors": "step"}
+COLUMNS = ["method", "level", "policy", "training", "author"]
+SCORES = [f"{what}_{noise}" for noise in NOISES for what in ("success", "gentle")]
+TOLERANCE = 1.0  # percentage points, six trials of 600
+
+
+@dataclass
+class Args:
+    what: Positional[Literal["check", "add"]]
+    """check rows, or add one"""
+    method: str = ""
+    """name of the method; check: its rows only"""
+    level: Literal["ideal", "hydraulic", "randomized"] = "ideal"
+    """level of the new row"""
+    policy: str = ""
+    """of the new row: a file as eval_crane.py takes it, scripted, or my_module:MyPolicy"""
+    training: str = ""
+    """what the training took, such as "1.02 million decisions" """
+    author: str = ""
+    """who made it, with a link to the code"""
+    board: Annotated[Path, tyro.conf.arg(help="the CSV file")] = BOARD
+
+
+def score(policy: str, level: str) -> dict[str, float]:
+    """SCORES in % of 600 trials of seed 40000."""
+    judge = [sys.executable, str(HERE.parent / "eval_crane.py"), "--json"]
+    judge += ["--env-id", LEVELS[level]]
+    own = policy == "scripted" or ":" in policy
+    judge += ["--policy", policy] if own else [policy]
+    scores = {}
+    for name, noise in NOISES.items():
+        ran = subprocess.run([*judge, "--pose-noise", noise], stdout=subprocess.PIPE, text=True)
+        if ran.returncode:
+            raise SystemExit(f"{policy} could not be judged")  # eval_crane.py has said why
+        answer = json.loads(ran.stdout.splitlines()[-1])
+        scores[f"success_{name}"] = round(100 * answer["mean_success_rate"], 1)
+        scores[f"gentle_{name}"] = round(100 * answer["mean_gentle_rate"], 1)
+    return scores
+
+
+def check(rows: list[dict[str, str]], method: str) -> list[str]:
+    """One line for each score that does not come again."""
+    wrong = []
+    chosen = [row for row in rows if method in ("", row["method"])]
+    if not chosen:
+        raise SystemExit(f"the leaderboard has no method {method!r}")
+    for row in tqdm(chosen, unit="row"):
+        for name, now in score(row["policy"], row["level"]).items():
+            if abs(now - float(row[name])) > TOLERANCE:
+                of = f"{row['method']} on {row['level']}"
+                wrong.append(f"{of}: {name} is {now} %, the row says {row[name]} %")
+    return wrong
+
+
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
+    rows = list(csv.DictReader(args.board.open())) if args.board.is_file() else []
+    if args.what == "check":
+        wrong = check(rows, args.method)
+        raise SystemExit("\n".join(wrong) or 0)
+    if not args.method or not args.policy:
+        raise SystemExit("add needs --method and --policy")
+    new = {name: getattr(args, name) for name in COLUMNS} | score(args.policy, args.level)
+    same = [row for row in rows if (row["method"], row["level"]) == (args.method, args.level)]
+    rows = [row for row in rows if row not in same] + [new]
+    unfinished = args.board.with_suffix(".tmp")
+    with unfinished.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*COLUMNS, *SCORES])
+        writer.writeheader()
+        writer.writerows(rows)
+    unfinished.replace(args.board)
+    print({name: new[name] for name in SCORES})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""What the documents say: their tables, their recipes, the installation."""
+
+import csv
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "benchmark"))
+
+import fill_docs  # noqa: E402
+import leaderboard  # noqa: E402
+
+COMPARE = (ROOT / "docs" / "compare.md").read_text()
+
+
+@pytest.mark.parametrize("path", fill_docs.DOCUMENTS, ids=lambda path: path.name)
+def test_tables_are_those_of_the_csv_files(path):
+    """`python benchmark/fill_docs.py` mends a failure."""
+    assert fill_docs.filled(path.read_text()) == path.read_text()
+
+
+def test_a_changed_number_is_noticed(monkeypatch):
+    text = (ROOT / "README.md").read_text()
+    rows = fill_docs.rows_of("leaderboard.csv")
+    rows[0]["success_exact"] = "12.3"
+    monkeypatch.setattr(fill_docs, "rows_of", lambda name: rows)
+    assert fill_docs.filled(text) != text and "12.3" in fill_docs.filled(text)
+
+
+def test_all_modules_are_installed():
+    installed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert set(installed["py-modules"]) == {path.stem for path in ROOT.glob("*.py")}
+
+
+def recipe(number: int) -> tuple[str, list[list[str]]]:
+    """Python code and command lines of a recipe in docs/compare.md."""
+    text = re.split(r"## Recipe \d.*\n", COMPARE)[number].partition("\n## ")[0]
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    commands = re.findall(r"```\n(.*?)```", re.sub(r"```python.*?```", "", text, flags=re.S), re.S)
+    lines = [shlex.split(line) for block in commands for line in block.splitlines()]
+    assert len(lines) + sum(len(block.splitlines()) for block in code) <= 15
+    return "".join(code), lines
+
+
+def run(folder: Path, words: list[str], *more: str) -> str:
+    words = [sys.executable, str(ROOT / words[1]), *words[2:], *more]
+    ran = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+QUICK = ("--trials", "1", "--diameters", "0.5", "--pose-noise", "none")
+
+
+@pytest.mark.slow
+def test_recipe_of_a_controller(tmp_path):
+    code, (judge,) = recipe(1)
+    (tmp_path / "my_controller.py").write_text(code)
+    assert "mine (my_controller:Follow) on ForestryCraneHydraulic-v0" in run(
+        tmp_path, judge, *QUICK
+    )
+
+
+@pytest.mark.slow
+def test_recipe_of_stable_baselines3(tmp_path):
+    code, (judge,) = recipe(2)
+    (tmp_path / "train.py").write_text(code.replace("1_000_000", "4_096"))
+    environment = {"PYTHONPATH": str(ROOT), "PATH": ""}
+    command = [sys.executable, "train.py"]
+    ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert "Stable-Baselines3 (sb3_ppo.zip)" in run(tmp_path, judge, *QUICK)
+
+
+@pytest.mark.slow
+def test_recipe_of_an_edited_script(tmp_path):
+    """With a network that the original script does not have."""
+    _, (copy, train, judge) = recipe(3)
+    assert copy[0] == "cp"
+    edited = (ROOT / copy[1]).read_text().replace("nn.Tanh()", "nn.ELU()")
+    (tmp_path / copy[2]).write_text(edited)
+    words = [sys.executable, *train[1:], "--total-timesteps", "4096", "--final-trials", "0"]
+    words += ["--eval-every", "0"]
+    environment = {"PYTHONPATH": str(ROOT), "PATH": ""}
+    ran = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    judge[2] = str(folder)
+    assert "mppo_beta (" in run(tmp_path, judge, *QUICK)
+
+
+@pytest.mark.slow
+def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(leaderboard, "score", lambda policy, level: dict(SCORES))
+    board = tmp_path / "board.csv"
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["leaderboard.py", *words, "--board", str(board)])
+        leaderboard.main()
+
+    call("add", "--method", "mine", "--policy", "model.zip", "--level", "hydraulic")
+    call("add", "--method", "mine", "--policy", "better.zip", "--level", "hydraulic")
+    call("add", "--method", "mine", "--policy", "model.zip")
+    rows = list(csv.DictReader(board.open()))
+    assert [(row["level"], row["policy"]) for row in rows] == [
+        ("hydraulic", "better.zip"),
+        ("ideal", "model.zip"),
+    ]
+    with pytest.raises(SystemExit, match="0"):
+        call("check", "--method", "mine")
+    with pytest.raises(SystemExit, match="no method 'yours'"):
+        call("check", "--method", "yours")
+    board.write_text(board.read_text().replace("93.5", "95.0"))
+    with pytest.raises(SystemExit, match="gentle_exact is 93.5 %, the row says 95.0 %"):
+        call("check")
+
+
+SCORES = {
+    "success_exact": 97.0,
+    "gentle_exact": 93.5,
+    "success_pose_errors": 96.0,
+    "gentle_pose_errors": 92.0,
+}
+
+
+@pytest.mark.slow
+def test_leaderboard_scores_are_the_judges(monkeypatch):
+    """With the scripted crane, which lifts all logs but a few."""
+    original = subprocess.run
+
+    def fewer(command, **kwargs):
+        return original([*command, "--trials", "2"], **kwargs)
+
+    monkeypatch.setattr(subprocess, "run", fewer)
+    scores = leaderboard.score("scripted", "ideal")
+    assert set(scores) == set(leaderboard.SCORES) and min(scores.values()) > 80
