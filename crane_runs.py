@@ -34,7 +34,7 @@ from crane_options import DEFAULTS
 MAX_BATCH = 2**20  # decisions of a rollout, all in memory
 # What --resume may change. Options in env may be repeated, but not changed.
 CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads", "env"}
-SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "charts/SPS"}
+SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "time/SPS"}
 LOCKS: list[FileLock] = []  # of the folders in which this process trains
 
 

@@ -64,7 +64,7 @@ def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[
     if isinstance(crane, CraneVectorEnv):
         if crane.recent_success:
             report["charts/success_rate"] = np.mean(crane.recent_success)
-        report["charts/difficulty"] = crane.difficulty
+        report["schedule/difficulty"] = crane.difficulty
         report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
         endings = [info["termination"][i] for info, i in ends]
         for name in TERMINATIONS:

@@ -268,14 +268,19 @@ def frame(crane: CraneVectorEnv, corner: Photographer | None, lines: list) -> Ar
     if corner is not None:
         inset = Image.fromarray(corner.show()[0])
         picture.paste(inset, (picture.width - inset.width, picture.height - inset.height))
+    return np.asarray(write_on(picture, lines))
+
+
+def write_on(picture: Image.Image, lines: list[tuple[str, str]]) -> Image.Image:
+    """The picture with lines of two columns at its top."""
     draw, height = ImageDraw.Draw(picture, "RGBA"), max(8, picture.height // 28)
     font = ImageFont.load_default(height)
     draw.rectangle((0, 0, 19 * height, (len(lines) + 0.5) * 1.25 * height), fill=(0, 0, 0, 120))
     for i, (name, value) in enumerate(lines):
         y = (i + 0.25) * 1.25 * height
-        draw.text((0.5 * height, y), name, font=font, fill=(200, 200, 200))
+        draw.text((0.5 * height, y), name, font=font, fill=(220, 220, 220))
         draw.text((8 * height, y), value, font=font, fill=(255, 255, 255))
-    return np.asarray(picture)
+    return picture
 
 
 class Keyboard:

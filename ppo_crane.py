@@ -303,14 +303,13 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = batch_size / (now - rollout_start)
-        report = {"charts/updates": iteration}
+        report = {"time/updates": iteration}
         report |= {name: np.mean(values) for name, values in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
-        report["losses/explained_variance"] = (
-            1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
-        )
-        report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
-        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
+        unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
+        report["losses/explained_variance"] = 1 - unexplained
+        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         run.finish_update(iteration, report)
 

@@ -16,7 +16,6 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
 Advantages A, returns R and what the time limit does are those of ppo_crane.py.
-
 Along the run the policy narrows, the horizon grows, the critic's step size falls (docs/trpo.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
@@ -209,9 +208,8 @@ def conjugate_gradient(
         step = residual_sq / (direction @ product)
         x += step * direction
         residual -= step * product
-        new_residual_sq = residual @ residual
-        direction = residual + new_residual_sq / residual_sq * direction
-        residual_sq = new_residual_sq
+        direction = residual + (residual @ residual) / residual_sq * direction
+        residual_sq = residual @ residual
     return x, (residual_sq.sqrt() / (b.norm() + 1e-30)).item()
 
 
@@ -389,14 +387,13 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = batch_size / (now - rollout_start)
-        report = {"charts/updates": iteration} | step_report
+        report = {"time/updates": iteration} | step_report
         report |= {name: np.mean(values) for name, values in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
-        report["losses/explained_variance"] = (
-            1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
-        )
-        report |= {"charts/gamma": gamma, "charts/learning_rate": left * args.learning_rate}
-        report |= {"charts/SPS": sps, "charts/simulation_SPS": sps * physics_steps}
+        unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
+        report["losses/explained_variance"] = 1 - unexplained
+        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         run.finish_update(iteration, report)
 

@@ -11,11 +11,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tyro.conf import Positional
 
 COLUMNS = {
-    "charts/updates": "updates",
+    "time/updates": "updates",
     "charts/episodic_return": "episodic_return",
     "charts/episodic_length": "episodic_length",
     "charts/success_rate": "training_success_rate",
-    "charts/SPS": "decisions_per_second",
+    "time/SPS": "decisions_per_second",
     "time/rollout": "rollout_s",
     "time/update": "update_s",
     "losses/approx_kl": "approx_kl",

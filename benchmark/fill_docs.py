@@ -56,7 +56,38 @@ def results() -> str:
     return table(["policy", "exact log pose", "gentle, exact pose", "with pose errors"], rows)
 
 
-TABLES = {"leaderboard": leaderboard, "results": results}
+def shipped() -> str:
+    """The leaderboard's policies of the ideal level, by file."""
+    columns = ["policy", "success_exact", "gentle_exact"]
+    columns += ["success_pose_errors", "gentle_pose_errors"]
+    rows = [row for row in rows_of("leaderboard.csv") if row["level"] == "ideal"]
+    header = ["policy", "exact pose", "gentle, exact pose", "pose errors", "gentle, pose errors"]
+    return table(
+        header,
+        [[f"`{Path(row[columns[0]]).name}`"] + [row[c] for c in columns[1:]] for row in rows],
+    )
+
+
+def seeds() -> str:
+    """Success and gentle success of each training seed, level by level."""
+    rows = rows_of("level_seeds.csv")
+    lines = []
+    for level, method in dict.fromkeys((row["level"], row["method"]) for row in rows):
+        mine = [row for row in rows if (row["level"], row["method"]) == (level, method)]
+        scores = []
+        for name in ("success", "gentle"):
+            numbers = [float(row[name]) for row in mine]
+            scores += [", ".join(row[name] for row in mine), f"{sum(numbers) / len(numbers):.1f}"]
+        decisions = f"{int(mine[0]['decisions']) / 1e6:.2f} million"
+        lines.append(
+            [level, method, decisions, ", ".join(r["training_seed"] for r in mine), *scores]
+        )
+    return table(
+        ["level", "method", "decisions", "seeds", "success", "mean", "gentle", "mean"], lines
+    )
+
+
+TABLES = {"leaderboard": leaderboard, "results": results, "shipped": shipped, "seeds": seeds}
 
 
 def filled(text: str) -> str:

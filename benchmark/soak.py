@@ -117,7 +117,7 @@ def kills() -> list[Row]:
         time.sleep(1.1)  # TensorBoard orders files by the second
         status = subprocess.run(command(algorithm, "--resume", run_dir), **quiet).returncode
         values = scalars(run_dir)
-        whole = values["charts/updates"] == list(range(1, 201))
+        whole = values["time/updates"] == list(range(1, 201))
         whole &= len(values["eval/episodic_return"]) == 200 // 7 + 1
         rows.append((f"{algorithm}, killed", at, "updates saved", int(status or not whole), ""))
         shutil.rmtree(folder)

@@ -102,7 +102,7 @@ def test_a_run_ends_at_the_first_weight_that_is_not_finite(
         saved = torch.load(only_run(tmp_path) / f"{name}.pt", weights_only=True)
         assert saved["global_step"] == 640
         assert all(tensor.isfinite().all() for tensor in saved["weights"].values())
-    assert scalars(only_run(tmp_path))["charts/updates"][-1] <= 11
+    assert scalars(only_run(tmp_path))["time/updates"][-1] <= 11
 
 
 @pytest.mark.filterwarnings("ignore:.*reward is a NaN")
@@ -166,7 +166,7 @@ def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_afterwards(
     assert before >= 10
     total = str(64 * (before + 20))
     run(algorithm, tmp_path, "--resume", run_dir, "--total-timesteps", total)
-    assert scalars(run_dir)["charts/updates"] == list(range(1, before + 21))
+    assert scalars(run_dir)["time/updates"] == list(range(1, before + 21))
 
 
 def begun(algorithm, cwd, *arguments, **how):
@@ -295,10 +295,10 @@ def test_resume_extends_a_run(finished, run_here):
     algorithm, run_dir = finished
     left = run_here(algorithm, "--resume", run_dir, "--total-timesteps", "256")
     values = scalars(run_dir)
-    assert values["charts/updates"] == [1, 2, 3, 4] and left["args"].total_timesteps == 256
+    assert values["time/updates"] == [1, 2, 3, 4] and left["args"].total_timesteps == 256
     # half of the longer run lay behind, and the schedule went on from there
     rate = left["args"].learning_rate
-    assert values["charts/learning_rate"] == pytest.approx([rate, rate / 2, rate / 2, rate / 4])
+    assert values["schedule/learning_rate"] == pytest.approx([rate, rate / 2, rate / 2, rate / 4])
     assert len(values["eval/episodic_return"]) == 4 and len(values["final/episodic_return"]) == 2
     assert torch.load(run_dir / "checkpoint.pt", weights_only=True)["args"]["resume"] is None
 
@@ -316,7 +316,7 @@ def test_resume_of_a_finished_run_changes_nothing(finished, run_here, capsys):
     before = (run_dir / "checkpoint.pt").read_bytes()
     run_here(algorithm, "--resume", run_dir)
     values = scalars(run_dir)
-    assert len(values["final/episodic_return"]) == 1 and values["charts/updates"] == [1, 2]
+    assert len(values["final/episodic_return"]) == 1 and values["time/updates"] == [1, 2]
     assert (run_dir / "checkpoint.pt").read_bytes() == before
     again = capsys.readouterr().out
     assert "all 2 updates are done; more --total-timesteps extend the run" in again
@@ -337,7 +337,7 @@ def test_resume_refuses_other_changes_by_name(finished, run_here):
     ]:
         with pytest.raises(SystemExit, match=f"^--resume: {said}"):
             run_here(algorithm, "--resume", run_dir, *arguments.split())
-    assert scalars(run_dir)["charts/updates"] == [1, 2]
+    assert scalars(run_dir)["time/updates"] == [1, 2]
 
 
 def test_options_of_the_crane_stay_as_they_were(tmp_path, run_here, monkeypatch):
@@ -398,7 +398,7 @@ def test_an_interrupted_evaluation_is_made_on_resume(tmp_path, run_here, monkeyp
         run_here(algorithm, "--resume", run_dir)
     run_here(algorithm, "--resume", run_dir)
     values = scalars(run_dir)
-    assert values["charts/updates"] == list(range(1, 21))
+    assert values["time/updates"] == list(range(1, 21))
     assert len(values["eval/episodic_return"]) == 4 and len(values["final/episodic_return"]) == 1
     assert len(calls) == 7
 

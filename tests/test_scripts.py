@@ -248,7 +248,7 @@ def test_an_update_stops_after_the_first_epoch_beyond_target_kl(tmp_path, run_he
 
 
 KEYS = """
-charts/SPS charts/simulation_SPS charts/learning_rate charts/gamma charts/updates charts/difficulty
+time/SPS time/simulation_SPS schedule/learning_rate schedule/gamma time/updates schedule/difficulty
 charts/episodic_return charts/episodic_length charts/success_rate
 losses/value_loss losses/policy_loss losses/entropy losses/explained_variance losses/grad_norm
 reward/distance reward/grapple reward/lift reward/balance reward/ground
@@ -262,7 +262,7 @@ CLIPPED = ["losses/old_approx_kl", "losses/approx_kl", "losses/clipfrac"]
 OWN_KEYS = {
     "mppo_beta": [
         *CLIPPED,
-        *"policy/alpha policy/beta policy/boundary_frac policy/perturbation".split(),
+        *"policy/alpha policy/beta policy/boundary_frac schedule/perturbation".split(),
     ],
     "ppo": [*CLIPPED, "policy/std"],
     "recurrent_ppo": [*CLIPPED, "policy/std"],
@@ -301,7 +301,7 @@ def test_two_updates_on_the_crane_same_seed_same_weights(tmp_path, run_here, alg
     assert set(values) == {*KEYS, *OWN_KEYS[algorithm]}
     assert all(np.isfinite(v).all() for v in values.values())
     assert values["losses/grad_norm"][0] > 0
-    assert len(values["eval/success_rate"]) == 1 and len(values["charts/gamma"]) == 2
+    assert len(values["eval/success_rate"]) == 1 and len(values["schedule/gamma"]) == 2
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -341,11 +341,11 @@ def test_the_papers_task_trains(tmp_path, run_here, algorithm):
     values = scalars(only_run(tmp_path))
     growth = 3 ** (1 - 0.5 / 0.75)  # in the second half of the run
     gamma = [0.9**0.05, (1 - 0.1 / growth) ** 0.05]
-    assert values["charts/gamma"] == pytest.approx(gamma, abs=1e-7)
+    assert values["schedule/gamma"] == pytest.approx(gamma, abs=1e-7)
     scale = 0.06 * 0.05 / growth
     paid = np.mean([sum(info[term] for term in crane_task.TERMS) for info in left["infos"]])
     assert left["rewards"].mean().item() == pytest.approx(scale * paid, rel=1e-5)
-    rates = np.array(values["charts/simulation_SPS"]) / values["charts/SPS"]
+    rates = np.array(values["time/simulation_SPS"]) / values["time/SPS"]
     np.testing.assert_allclose(rates, 1, rtol=1e-5)
     again = left["compute_gae"](
         left["rewards"],
@@ -425,9 +425,9 @@ def test_killed_run_goes_on(tmp_path, run_here, algorithm):
         steps = [s["step"].item() for s in after["optimizer"]["state"].values()]
         assert set(steps) == {50 * 4.0}  # 2 epochs of 2 minibatches each: Adam's count went on
         values = scalars(run_dir)
-        assert values["charts/updates"] == list(range(1, 51))  # none twice, none missing
+        assert values["time/updates"] == list(range(1, 51))  # none twice, none missing
         lr = after["args"]["learning_rate"]
-        assert values["charts/learning_rate"] == pytest.approx(lr * (1 - np.arange(50) / 50))
+        assert values["schedule/learning_rate"] == pytest.approx(lr * (1 - np.arange(50) / 50))
         assert after["weights"]["obs_count"] == pytest.approx(3200, abs=1)
         assert {p.name for p in run_dir.glob("*.*") if "tfevents" not in p.name} == {
             "policy.pt",
@@ -452,13 +452,13 @@ def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, monkeypatch, al
     arguments += ["--warm-up", "0.5", "--env.difficulty", "0.8", "--final-trials", "0"]
     run_here(algorithm, *arguments)
     folder = only_run(tmp_path)
-    difficulties = scalars(folder)["charts/difficulty"]
+    difficulties = scalars(folder)["schedule/difficulty"]
     np.testing.assert_allclose(difficulties, [0.2, 0.4, 0.6, 0.8, 0.8, 0.8, 0.8, 0.8], rtol=1e-6)
     path = folder / "checkpoint.pt"
     torch.save(torch.load(path, weights_only=True) | {"iteration": 2}, path)
     left = run_here(algorithm, "--resume", folder)
     assert left["run"].first_iteration == 3 and left["envs"].unwrapped.difficulty == 0.8
-    np.testing.assert_allclose(scalars(folder)["charts/difficulty"][2:4], [0.6, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(scalars(folder)["schedule/difficulty"][2:4], [0.6, 0.8], rtol=1e-6)
     np.testing.assert_allclose(first, [0.2, 0.6], rtol=1e-6)
 
 
@@ -486,7 +486,7 @@ def test_a_stopped_run_ends_with_its_update(tmp_path, run_here, algorithm, signu
     assert iteration >= 10 and tmp_path / said[2] == run_dir
     policy = torch.load(run_dir / "policy.pt", weights_only=True)
     checkpoint = torch.load(run_dir / "checkpoint.pt", weights_only=True)
-    assert checkpoint["iteration"] == iteration == scalars(run_dir)["charts/updates"][-1]
+    assert checkpoint["iteration"] == iteration == scalars(run_dir)["time/updates"][-1]
     assert checkpoint["global_step"] == policy["global_step"] == iteration * 64
     updates = {s["step"].item() for s in checkpoint["optimizer"]["state"].values()}
     assert updates == {4.0 * iteration}  # the update under way was finished
@@ -494,7 +494,7 @@ def test_a_stopped_run_ends_with_its_update(tmp_path, run_here, algorithm, signu
     torch.save(checkpoint, run_dir / "checkpoint.pt")
     next_second()
     run_here(algorithm, "--resume", said[2])
-    assert scalars(run_dir)["charts/updates"] == list(range(1, iteration + 2))
+    assert scalars(run_dir)["time/updates"] == list(range(1, iteration + 2))
 
 
 def test_a_second_ctrl_c_stops_at_once_and_nohup_is_respected(tmp_path):
@@ -657,7 +657,7 @@ def test_time_limit_is_not_the_end_of_the_world(tmp_path, run_here, algorithm):
         updates, own = 150, " --learning-rate 1e-2 --lstm-size 4"
     arguments += f" --total-timesteps {288 * updates} {own}"
     agent = run_here(algorithm, *arguments.split())["agent"]
-    gamma = scalars(only_run(tmp_path))["charts/gamma"]
+    gamma = scalars(only_run(tmp_path))["schedule/gamma"]
     assert len(gamma) == updates and gamma[updates // 4] == pytest.approx(0.9)
     assert gamma[updates // 4 + 2] > 0.9001
     assert gamma[-1] == pytest.approx(1 - 0.1 / 3 ** (1 - 1 / (0.75 * updates)))
@@ -680,15 +680,15 @@ def test_schedules_along_the_run(tmp_path, run_here, algorithm):
     if algorithm == "mppo_beta":
         width, expected = saved["weights"]["actor.4.bias"], saved["args"]["log_excess_init"] + 0.6
         assert (np.diff(values["policy/alpha"]) > 0.1).all()
-        assert values["policy/perturbation"] == pytest.approx([0.1, 0.05, 0, 0])
+        assert values["schedule/perturbation"] == pytest.approx([0.1, 0.05, 0, 0])
     else:
         width, expected = saved["weights"]["log_std"], saved["args"]["log_std_init"] - 0.6
         assert values["policy/std"] == pytest.approx(np.exp([-1.2, -1.35, -1.5, -1.65]), rel=1e-3)
     torch.testing.assert_close(width, torch.full_like(width, expected), rtol=0, atol=1e-4)
-    rates = np.array(values["charts/learning_rate"]) / 1e-30
+    rates = np.array(values["schedule/learning_rate"]) / 1e-30
     np.testing.assert_allclose(rates, [1, 0.75, 0.5, 0.25], rtol=1e-5)
     growth = 3 ** np.array([0, 0, 1 / 3, 2 / 3])  # from a quarter of the run on
-    assert values["charts/gamma"] == pytest.approx(1 - 0.03 / growth)
+    assert values["schedule/gamma"] == pytest.approx(1 - 0.03 / growth)
 
 
 RECALL = "--env-id recall_env:Recall-v0 --num-envs 16 --num-steps 18 --update-epochs 4 --gamma 1"

@@ -94,7 +94,7 @@ def test_a_killed_rank_ends_the_run_and_any_number_of_ranks_goes_on(tmp_path):
     result = torchrun(tmp_path, *line, ranks=1)
     assert result.returncode == 0, result.stderr[-2000:]
     done += 1
-    assert scalars(folder)["charts/updates"] == list(range(1, done + 1))
+    assert scalars(folder)["time/updates"] == list(range(1, done + 1))
 
 
 def test_two_machines_train_together(tmp_path):

@@ -103,7 +103,7 @@ def test_rollout_report_of_cranes():
     envs = make_envs("ForestryCrane-v0", 3, 1)
     crane = envs.unwrapped
     assert rollout_report(envs, [step_info(["none"] * 3, [False], r_grapple=0, r_lift=0)]) == {
-        "charts/difficulty": 1.0,
+        "schedule/difficulty": 1.0,
         **{f"reward/{name}": 0.0 for name in ("distance", "grapple", "lift", "balance", "ground")},
         **{f"termination/{name}": 0.0 for name in crane_task.TERMINATIONS},
     }
@@ -126,7 +126,7 @@ def test_rollout_report_of_cranes():
         "charts/episodic_return": (5 + 40 + 30 + 1) / 4,
         "charts/episodic_length": (10 + 90 + 90 + 60) / 4,
         "charts/success_rate": 0.75,
-        "charts/difficulty": 0.35,
+        "schedule/difficulty": 0.35,
         "reward/distance": 0.0,
         "reward/grapple": (2 + 0 + 0 + 0) / 4,
         "reward/lift": (0 + 1 + 0 + 0) / 4,
