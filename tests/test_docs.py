@@ -163,7 +163,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
         shutil.copy(path, tmp_path)
     text = (tmp_path / "docs" / "tutorial.md").read_text()
     for whole, short in [
-        ("300000", "4096 --eval-trials 1 --final-trials 0"),
+        ("300000", "2048 --eval-every 1 --eval-trials 1 --final-trials 0"),
         ("--pose-noise none", "--pose-noise none --trials 1"),
         ("--diameters 0.5", "--diameters 0.5 --width 64"),
     ]:
@@ -176,7 +176,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     printed = "".join(out.get("text", "") for c in notebook.cells for out in c.get("outputs", []))
     for wanted in (
         "policy saved to",
-        "4096 decisions: 0 %",
+        "2048 decisions: 0 %",
         "1 trials filmed in first.mp4",
         "runs/ForestryCrane-v0__no_ground",
         "runs/ForestryCrane-v0__silu",
