@@ -70,7 +70,7 @@ import ctypes.util
 import os
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Unpack
 from weakref import WeakSet
@@ -171,6 +171,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.process = os.getpid()
         self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
         self.viewer = None  # the window, or the renderer of "rgb_array"
+        self.watch: Callable[[float], None] | None = None  # after each piece, with its seconds
         self.speed, self.frame_skip = SPEEDS[options["speed"]], int(options["frame_skip"])
         self.difficulty = options["difficulty"]
         self.dt = self.frame_skip * TIMESTEP  # s, one decision
@@ -326,7 +327,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.recent_success.append(bool(info["success"][i]))
             if not info["success"][i]:
                 self.failures[i].append(self.starts[i])  # for retry
-        if self.render_mode == "human":
+        if self.render_mode == "human" and self.watch is None:
             self.render()
         return obs, np.where(diverged, 0.0, reward), terminated, truncated, info
 
@@ -362,6 +363,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             except SimulationError as error:
                 failed[error.ids] = True
             self.count_costs(nstep * TIMESTEP)
+            if self.watch is not None:
+                self.watch(nstep * TIMESTEP)
         finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
         return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
 

@@ -21,6 +21,7 @@ from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 CAMERAS = ["overview", "side", "grapple"]
 LEVERS = [("Q", "A"), ("W", "S"), ("E", "D"), ("R", "F"), ("T", "G"), ("U", "J")]  # of each action
+FPS = 20  # of a film
 HELP = [
     ("Q A", "slew"),
     ("W S", "boom"),
@@ -37,6 +38,14 @@ HELP = [
     ("C", "camera"),
     ("Esc", "close"),
 ]
+
+UNKNOWN = {  # info that `reset` lacks and `caption` shows
+    "termination": np.array(["none"]),
+    "time_to_reach": np.array([np.inf]),
+    "time_up": np.array([np.inf]),
+    "ground_peak": np.zeros(1),
+    "litres": np.zeros(1),
+}
 
 
 class Photographer:
@@ -94,6 +103,7 @@ class Window:
         glfw.set_key_callback(self.window, self.on_key)
         glfw.set_cursor_pos_callback(self.window, self.on_move)
         glfw.set_scroll_callback(self.window, self.on_scroll)
+        mujoco.mj_forward(self.model, self.data)  # places the cameras if there was no reset yet
         self.look_from(cranes.camera)
 
     def look_from(self, name: str) -> None:
@@ -126,7 +136,7 @@ class Window:
                 self.move_camera(motion, (x - before_x) / height, (y - before_y) / height)
 
     def on_scroll(self, window: Any, x: float, y: float) -> None:
-        self.move_camera(mujoco.mjtMouse.mjMOUSE_ZOOM, 0.0, -0.05 * y)
+        self.move_camera(mujoco.mjtMouse.mjMOUSE_ZOOM, 0.0, 0.05 * y)
 
     def move_camera(self, motion: mujoco.mjtMouse, x: float, y: float) -> None:
         mujoco.mjv_moveCamera(self.model, motion, x, y, self.camera)
@@ -144,6 +154,7 @@ class Window:
         """Draw the crane as it is now, and read keys and mouse."""
         if not self.is_running():
             return
+        self.glfw.make_context_current(self.window)  # another crane may have drawn since
         self.batch.get_model(0, self.model)
         self.batch.get_data(0, self.data)
         every = mujoco.mjtCatBit.mjCAT_ALL
@@ -163,6 +174,7 @@ class Window:
 
     def close(self) -> None:
         if self.window is not None:
+            self.glfw.make_context_current(self.window)
             self.context.free()
             self.glfw.destroy_window(self.window)
         self.window = None
@@ -170,23 +182,21 @@ class Window:
 
 def caption(crane: CraneVectorEnv, info: dict[str, Array], driver: str) -> list[tuple[str, str]]:
     """What a film and the window say of crane 0 after `advance`, in two columns."""
-    seconds, ended = crane.decisions[0] * crane.dt, info["termination"][0] != "none"
+    ended = info["termination"][0] != "none"
     if ended and not info["success"][0]:
         names = [name for name in crane_task.CONDITIONS if info[name][0]]
         phase = info["termination"][0] if info["termination"][0] != "time_limit" else names[0]
         phase = f"failed: {phase}".replace("_", " ")
     elif ended:
         phase = "success"
-    elif np.isfinite(info["time_up"][0]):
-        phase = "holding"
     elif info["clearance"][0] > 0.01:
-        phase = "lifting"
+        phase = "holding" if np.isfinite(info["time_up"][0]) else "lifting"
     else:
         phase = "gripping" if np.isfinite(info["time_to_reach"][0]) else "reaching"
     return [
         ("log", f"{info['diameter'][0]:.2f} m, {info['log_mass'][0]:.0f} kg"),
         ("driver", driver),
-        ("time", f"{seconds:.1f} s"),
+        ("time", f"{crane.decisions[0] * crane.dt:.1f} s"),
         ("phase", phase),
         ("on the ground", f"{info['ground_peak'][0] / 1e3:.0f} kN at most"),
         ("oil", f"{info['litres'][0]:.1f} l"),
@@ -206,58 +216,59 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 class Trial:
-    """One trial of one crane, seen more often than it decides."""
+    """One trial of one crane, as `crane_trials.run_trials` plays it, one decision after another."""
 
-    def __init__(self, crane: CraneVectorEnv, substeps: int, seed: Any, diameter: float):
-        self.crane, self.substeps, self.step, self.state = crane, substeps, 0, None
+    def __init__(self, crane: CraneVectorEnv, seed: Any, diameter: float):
+        self.crane, self.state, self.ended = crane, None, False
         crane.fixed_diameter = np.array([diameter])
         self.obs, self.info = crane.reset(seed=[seed])
-        self.ended = False
 
     def advance(self, policy: Any, deterministic: bool = True) -> None:
-        """Go on by a part of a decision."""
-        if self.step % self.substeps == 0:
-            act = policy.predict(self.obs, self.state, deterministic=deterministic)
-            self.actions, self.state = act
-        self.obs, _, terminated, truncated, info = self.crane.advance(self.actions)
+        """Go on by a decision. After the end `info` stays that of the end."""
+        actions, self.state = policy.predict(self.obs, self.state, deterministic=deterministic)
+        self.obs, _, terminated, truncated, info = self.crane.advance(actions)
         if not self.ended:
             self.info, self.ended = info, bool(terminated[0] or truncated[0])
-        self.step += 1
-
-
-def make_crane(env_id: str, options: dict, frames: int, scene: dict) -> tuple[CraneVectorEnv, int]:
-    """One crane whose decisions are split into up to `frames` parts, and their number."""
-    skip = make_envs(env_id, 1, **options).unwrapped.frame_skip
-    parts = next(n for n in range(frames, 0, -1) if skip % n == 0)
-    options = options | scene | {"frame_skip": skip // parts}
-    return make_envs(env_id, 1, diameter=0.5, **options).unwrapped, parts
 
 
 def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> None:
     """One trial per diameter, 20 frames a second, with the grapple in a corner."""
-    size = {"width": args.width, "height": args.width * 9 // 32 * 2}
-    scene = size | {"render_mode": "rgb_array", "camera": args.camera}
-    crane, parts = make_crane(env_id, options, 2, scene)
+    scene = {"width": args.width, "height": args.width * 9 // 32 * 2, "camera": args.camera}
+    crane = make_envs(
+        env_id, 1, diameter=0.5, render_mode="rgb_array", **scene, **options
+    ).unwrapped
     corner = None if args.camera == "grapple" else Photographer(crane, 1 / 3, "grapple")
-    frame_every = max(1, round(0.05 / crane.dt))
-    fps = round(1 / (frame_every * crane.dt))
     gif = args.video.suffix.lower() == ".gif"
-    how = {"duration": 1000 / fps, "loop": 0} if gif else {"fps": fps, "macro_block_size": 2}
+    how = {"duration": 1000 / FPS, "loop": 0} if gif else {"fps": FPS, "macro_block_size": 2}
     diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
-    frames = round(crane_task.TIME_LIMIT * fps) * len(seeds)  # fewer where a trial ends early
-    bar = tqdm(total=frames, unit="frame", leave=False)
+    frames = round(crane_task.TIME_LIMIT * FPS) * len(seeds)  # fewer where a trial ends early
+    bar, filmed = tqdm(total=frames, unit="frame", leave=False), 0.0
     with whole_file(args.video) as path, bar, imageio.get_writer(path, **how) as video:
+
+        def watch(seconds: float) -> None:
+            """A frame each time that 1 / FPS s have passed."""
+            nonlocal filmed
+            filmed += seconds
+            if filmed * FPS < 1 - 1e-9:
+                return
+            filmed -= 1 / FPS
+            start = time.time()
+            video.append_data(frame(crane, corner, caption(crane, trial.info, driver)))
+            if bar.n == 1:  # the first also compiles the shaders
+                minutes = frames * (time.time() - start) / 60
+                bar.write(f"a film of {frames} frames takes about {minutes:.1f} minutes")
+            bar.update()
+
+        crane.watch = watch
         for diameter, seed in zip(diameters, seeds):
-            trial = Trial(crane, parts, seed, diameter)
+            trial = Trial(crane, seed, diameter)
+            trial.info |= UNKNOWN
             while not trial.ended:
                 trial.advance(policy, not args.stochastic)
-                if (trial.step - 1) % frame_every == 0 or trial.ended:
-                    start = time.time()
-                    video.append_data(frame(crane, corner, caption(crane, trial.info, driver)))
-                    if bar.n == 1:  # the first also compiles the shaders
-                        minutes = frames * (time.time() - start) / 60
-                        bar.write(f"a film of {frames} frames takes about {minutes:.1f} minutes")
-                    bar.update()
+            for _ in range(FPS // 2):  # half a second to read how it ended
+                video.append_data(frame(crane, corner, caption(crane, trial.info, driver)))
+    if corner is not None:
+        corner.close()
     crane.close()
     print(f"{len(seeds)} trials filmed in {args.video}")
 
@@ -296,22 +307,38 @@ class Keyboard:
 
 def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> None:
     """Trials in a window, in real time, until it is closed. Keys: HELP."""
-    crane, parts = make_crane(env_id, options, 5, {"render_mode": "human", "camera": args.camera})
-    hydraulic = crane.options["actuators"] == "hydraulic"
-    scripted = ScriptedCrane(crane.options["signed_yaw"], HYDRAULIC if hydraulic else IDEAL)
+    scene = {"render_mode": "human", "camera": args.camera}
+    crane = make_envs(env_id, 1, diameter=0.5, **scene, **options).unwrapped
     crane.reset(seed=args.seed)
-    window, cameras = crane.viewer, CAMERAS.copy()
+    window, first = crane.viewer, CAMERAS.index(args.camera)
+    cameras = CAMERAS[first:] + CAMERAS[:first]
     window.help = HELP
-    drivers = {driver: policy, "scripted": scripted, "keyboard": Keyboard(window)}
+    drivers = {driver: policy, "keyboard": Keyboard(window)}
+    task = {name: crane.options[name] for name in ("axes", "offset", "frame_skip")}
+    if task == {"axes": "crane", "offset": "plus", "frame_skip": 20}:  # what it knows
+        settings = HYDRAULIC if crane.options["actuators"] == "hydraulic" else IDEAL
+        drivers["scripted"] = ScriptedCrane(crane.options["signed_yaw"], settings)
     names, number, diameter, speed, paused = list(drivers), 0, args.diameters[0], 1.0, False
+    drawn_at = time.time()
 
     def new_trial() -> Trial:
         seed = monte_carlo_trials(args.seed, number + 1, [diameter])[1][-1]
-        return Trial(crane, parts, seed, diameter)
+        trial = Trial(crane, seed, diameter)
+        trial.info |= UNKNOWN
+        window.text = caption(crane, trial.info, names[0])
+        return trial
 
+    def watch(seconds: float) -> None:
+        """Draw in time with the clock."""
+        nonlocal drawn_at
+        window.show()
+        time.sleep(max(0.0, seconds / speed - (time.time() - drawn_at)))
+        drawn_at = time.time()
+
+    crane.watch = watch
     trial, ended_at = new_trial(), np.inf
     while window.is_running():
-        start, again = time.time(), False
+        again = False
         for key in window.pressed:
             if key == "TAB":
                 names.append(names.pop(0))
@@ -331,17 +358,18 @@ def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             elif key in ("ENTER", "BACKSPACE"):
                 again, number = True, number + (key == "ENTER")
         window.pressed.clear()
-        if time.time() > ended_at + 2 and names[0] != "keyboard":
+        if paused:
+            ended_at = time.time() if trial.ended else np.inf
+        elif time.time() > ended_at + 2 and names[0] != "keyboard":
             again, number = True, number + 1
         if again:
             trial, ended_at = new_trial(), np.inf
         if paused:
-            window.show()
-        else:
-            was_ended = trial.ended
-            trial.advance(drivers[names[0]], not args.stochastic)
-            window.text = caption(crane, trial.info, names[0])
-            if trial.ended and not was_ended:
-                ended_at = time.time()
-        time.sleep(max(0.0, crane.dt / speed - (time.time() - start)))
+            watch(0.02)
+            continue
+        was_ended = trial.ended
+        trial.advance(drivers[names[0]], not args.stochastic)
+        window.text = caption(crane, trial.info, names[0])
+        if trial.ended and not was_ended:
+            ended_at = time.time()
     crane.close()

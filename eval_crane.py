@@ -60,7 +60,7 @@ class Args:
     """a run's folder or a policy.pt, a model of Stable-Baselines3 (.zip), or an .onnx file"""
     policy: str = "file"
     """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions;
-    my_module:MyPolicy: your own. MyPolicy()(obs) or MyPolicy().predict(obs, state) gives actions"""
+    my_module:MyPolicy: your own. MyPolicy()(obs) gives actions (docs/compare.md)"""
     env_id: str | None = None
     """task to judge on; unset: the one the policy was trained on, or ForestryCrane-v0"""
     contact: Literal["primitive", "sdf"] | None = None
@@ -218,7 +218,7 @@ class OwnPolicy:
         try:
             self.make = getattr(importlib.import_module(module), attribute)
             inspect.signature(self.make).bind()
-        except (ImportError, AttributeError, TypeError, ValueError) as error:
+        except (ImportError, AttributeError, TypeError, ValueError, SyntaxError) as error:
             wanted = f"{attribute or 'it'} must be a class or function without arguments"
             raise SystemExit(f"--policy {name}: {error}; {wanted}") from None
         self.name = name
@@ -227,12 +227,19 @@ class OwnPolicy:
         """state: the user's object and, if it has `predict`, its own state."""
         policy, memory = (self.make(), None) if state is None else state
         if hasattr(policy, "predict"):
-            actions, memory = policy.predict(obs, memory, deterministic=deterministic)
+            answer = policy.predict(obs, memory, deterministic=deterministic)
+            if not isinstance(answer, tuple) or len(answer) != 2:
+                raise SystemExit(f"--policy {self.name}: predict must return actions and a state")
+            actions, memory = answer
         elif callable(policy):
             actions = policy(obs)
         else:
             raise SystemExit(f"--policy {self.name}: {policy!r} is no function and has no predict")
-        actions = torch.as_tensor(actions).detach().numpy()
+        try:
+            actions = torch.as_tensor(actions).detach().cpu().numpy()
+        except (TypeError, ValueError, RuntimeError):
+            kind = type(actions).__name__
+            raise SystemExit(f"--policy {self.name}: actions are a {kind}, no array") from None
         if actions.shape != (len(obs), 6) or not np.isfinite(actions).all():
             wanted = f"({len(obs)}, 6) finite numbers for observations {obs.shape}"
             raise SystemExit(f"--policy {self.name}: actions {actions.shape}, not {wanted}")

@@ -87,7 +87,49 @@ def seeds() -> str:
     )
 
 
-TABLES = {"leaderboard": leaderboard, "results": results, "shipped": shipped, "seeds": seeds}
+def matrix() -> str:
+    """Success and gentle success of each policy of training seed 1 on each level."""
+    rows = [row for row in rows_of("levels.csv") if row["seed"] == "1"]
+    levels = ["ideal", "hydraulic", "randomized"]
+    lines = []
+    for method, trained_on in dict.fromkeys((row["method"], row["trained_on"]) for row in rows):
+        cells = {}
+        for row in rows:
+            if (row["method"], row["trained_on"]) == (method, trained_on):
+                success, gentle = float(row["success"]), float(row["gentle"])
+                cells[row["judged_on"]] = f"{success:.1f} / {gentle:.1f}"
+        lines.append([method, trained_on, *[cells[level] for level in levels]])
+    return table(["method", "made for", *[f"judged on {level}" for level in levels]], lines)
+
+
+def costs() -> str:
+    """What the trials of each policy cost on its own level."""
+    names = ["ground_peak_kN", "energy_kJ", "litres", "time_up_s"]
+    lines = []
+    for row in rows_of("levels.csv"):
+        if row["trained_on"] == row["judged_on"] and row["seed"] == "1":
+            lines.append(
+                [row["trained_on"], row["method"], *[f"{float(row[n]):.1f}" for n in names]]
+            )
+    header = [
+        "level",
+        "method",
+        "peak force on the ground [kN]",
+        "energy [kJ]",
+        "oil [l]",
+        "up [s]",
+    ]
+    return table(header, sorted(lines, key=lambda line: line[0] != "ideal"))
+
+
+TABLES = {
+    "leaderboard": leaderboard,
+    "results": results,
+    "shipped": shipped,
+    "seeds": seeds,
+    "matrix": matrix,
+    "costs": costs,
+}
 
 
 def filled(text: str) -> str:
@@ -97,8 +139,8 @@ def filled(text: str) -> str:
         if begin not in text:
             continue
         before, _, rest = text.partition(begin)
-        _, end, after = rest.partition("<!-- end -->")
-        if not end:
+        old, end, after = rest.partition("<!-- end -->")
+        if not end or "<!--" in old:
             raise ValueError(f"the table {name} has no <!-- end -->")
         text = f"{before}{begin}\n{make()}\n{end}{after}"
     return text

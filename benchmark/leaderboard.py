@@ -85,6 +85,12 @@ def check(rows: list[dict[str, str]], method: str) -> list[str]:
 def main() -> None:
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     rows = list(csv.DictReader(args.board.open())) if args.board.is_file() else []
+    if args.what == "check" and not rows:
+        raise SystemExit(f"{args.board} has no rows")
+    if unknown := {row["level"] for row in rows} - LEVELS.keys():
+        raise SystemExit(f"{args.board}: no level {', '.join(unknown)}; there are {list(LEVELS)}")
+    if not args.board.parent.is_dir():
+        raise SystemExit(f"no folder {args.board.parent}; make it first")
     if args.what == "check":
         wrong = check(rows, args.method)
         raise SystemExit("\n".join(wrong) or 0)

@@ -23,6 +23,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_runs
+import crane_trials
 import crane_view
 import eval_crane
 from crane_trials import monte_carlo_trials
@@ -39,9 +40,9 @@ def frames_of(
     args = eval_crane.Args(seed=SEED)
     env_id, options = eval_crane.task_of(args, task)
     scene = {"render_mode": "rgb_array", "width": size[0], "height": size[1]}
-    crane, parts = crane_view.make_crane(env_id, options, 1, scene)
+    crane = crane_trials.make_envs(env_id, 1, diameter=diameter, **scene, **options).unwrapped
     seed = monte_carlo_trials(SEED, number + 1, [diameter])[1][-1]
-    trial = crane_view.Trial(crane, parts, seed, diameter)
+    trial = crane_view.Trial(crane, seed, diameter)
     yield 0.0, crane.render()[0], trial.info
     while not trial.ended:
         trial.advance(policy)
@@ -107,6 +108,8 @@ def failures(policy: Any, task: dict) -> None:
             )
             what = f"{diameter} m, {record['failure'].replace('_', ' ')}, {time:.1f} s"
             shots.append(labelled(picture, what))
+    if not shots:
+        raise SystemExit("none of the trials failed")
     sheet(shots, 3, FIGURES / "failures.jpg")
 
 

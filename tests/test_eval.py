@@ -444,6 +444,9 @@ def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
         "def lost(): return lambda obs: np.full((len(obs), 6), np.nan)\n"
         "def needy(gain): pass\n"
         "def dumb(): return 5\n"
+        "def empty(): return lambda obs: None\n"
+        "class Bare:\n"
+        "    def predict(self, obs, state, deterministic): return np.zeros((len(obs), 6))\n"
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(eval_crane, "CRANES", 4)
@@ -456,6 +459,8 @@ def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
         ("my_module:lost", r"actions \(4, 6\), not \(4, 6\) finite numbers"),
         ("my_module:needy", "missing a required argument: 'gain'; needy must be a class or"),
         ("my_module:dumb", "5 is no function"),
+        ("my_module:empty", "actions are a NoneType, no array"),
+        ("my_module:Bare", "predict must return actions and a state"),
         ("my_module:wide", r"actions \(4, 7\), not \(4, 6\) finite numbers for observations"),
         ("my_module:nothing", "--policy my_module:nothing: .*nothing"),
         ("no_module:Policy", "--policy no_module:Policy: No module named 'no_module'"),

@@ -7,15 +7,18 @@ import sys
 import time
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 
 import crane_env
+import crane_trials
 import crane_view
 import eval_crane
 import machine
 from crane_env import CraneVectorEnv
 from crane_trials import monte_carlo_trials
+from scripted_crane import IDEAL, ScriptedCrane
 
 LOOK = """
 import glfw, mujoco, numpy as np
@@ -34,7 +37,12 @@ for name in ("overview", "side"):
     red, green, blue = np.moveaxis(pixels.astype(int), -1, 0)
     paint = ((red > 100) & (green < red / 2) & (blue < red / 2)).mean()
     assert 0.005 < paint < 0.1, (name, paint)
-window.move_camera(mujoco.mjtMouse.mjMOUSE_ZOOM, 0, -0.2)
+far = window.camera.distance
+window.on_scroll(None, 0, 1)
+assert window.camera.distance < 0.99 * far
+other = CraneVectorEnv(1, diameter=0.3, render_mode="human")
+other.reset(seed=1)
+window.show()
 window.on_key(None, glfw.KEY_TAB, 0, glfw.PRESS, 0)
 assert window.pressed == ["TAB"] and not window.held("Q")
 envs.close()
@@ -116,14 +124,38 @@ def test_keys_of_the_window(monkeypatch):
     window, slept = look(
         monkeypatch,
         [(10, "UP"), (20, "LEFT"), (30, "C"), (40, "TAB"), (50, "TAB"), (90, "ESCAPE")],
-        {"Q": range(60, 80)},
+        {"Q": range(50, 70)},
     )
     assert not window.open and window.views == ["side"]
     assert window.seen[8]["log"].startswith("0.40 m") and window.seen[15]["log"].startswith("0.50")
-    assert [window.seen[k]["driver"] for k in (35, 45, 85)] == ["zero", "scripted", "keyboard"]
-    assert window.seen[88]["q1"] - window.seen[60]["q1"] > 0.12  # 0.4 s at up to 0.8 rad/s
-    assert abs(window.seen[85]["q1"] - window.seen[88]["q1"]) < 0.03  # it has let go
+    assert [window.seen[k]["driver"] for k in (35, 48, 85)] == ["zero", "keyboard", "scripted"]
     assert np.median(slept[25:]) > 2 * np.median(slept[:15])
+
+
+def test_a_lever_moves_its_joint_until_it_is_let_go(monkeypatch):
+    window, _ = look(monkeypatch, [(1, "TAB"), (120, "ESCAPE")], {"Q": range(20, 60)})
+    q1 = [shown["q1"] for shown in window.seen]
+    assert q1[70] - q1[20] > 0.4  # one second at up to 0.8 rad/s
+    assert abs(q1[18] - q1[10]) < 0.02 and abs(q1[118] - q1[90]) < 0.02
+
+
+@pytest.mark.parametrize("env_id", ["ForestryCrane-v0", "ForestryCraneHydraulic-v0"])
+def test_what_is_shown_is_the_trial_that_is_judged(env_id):
+    """To the last bit, though it is drawn several times in a decision."""
+    options = {"diameter": 0.3, "pose_noise": "step"}
+    seed = monte_carlo_trials(40_000, 1, [0.3])[1]
+    scripted = ScriptedCrane(settings=IDEAL)
+    judged = crane_trials.run_trials(scripted, crane_trials.make_envs(env_id, 1, **options), seed)
+    crane = CraneVectorEnv(1, **options, **gymnasium.spec(env_id).kwargs)
+    drawn = []
+    crane.watch = drawn.append
+    trial = crane_view.Trial(crane, seed[0], 0.3)
+    while not trial.ended:
+        trial.advance(scripted)
+    for name in ("success", "ground_peak", "litres", "swing_peak", "centre_miss"):
+        assert trial.info[name][0] == judged[name][0], name
+    assert np.sum(drawn) == pytest.approx(crane.decisions[0] * 0.1)
+    assert len(drawn) == crane.decisions[0] * (5 if crane.hydraulic else 4)
 
 
 def test_the_next_trial_is_the_judges(monkeypatch):
@@ -136,7 +168,7 @@ def test_the_next_trial_is_the_judges(monkeypatch):
         original(envs, ids, q, log_pose, diameter)
 
     monkeypatch.setattr(CraneVectorEnv, "place", place)
-    look(monkeypatch, [(5, "ENTER"), (10, "BACKSPACE"), (15, "DOWN"), (20, "ESCAPE")])
+    look(monkeypatch, [(5, "ENTER"), (15, "BACKSPACE"), (25, "DOWN"), (35, "ESCAPE")])
     starts = starts[1:]  # the first opens the window
     for k, (trial, diameter) in enumerate([(0, 0.4), (1, 0.4), (1, 0.4), (1, 0.3)]):
         seed = monte_carlo_trials(40_000, 2, [diameter])[1][trial]
