@@ -17,9 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 import tyro
 from tqdm import tqdm
 from tyro.conf import Positional
+
+import crane_env
 
 HERE = Path(__file__).parent
 BOARD = HERE / "leaderboard.csv"
@@ -29,7 +33,7 @@ LEVELS = {
     "randomized": "ForestryCraneRandomized-v0",
 }
 NOISES = {"exact": "none", "pose_errors": "step"}
-COLUMNS = ["method", "level", "policy", "training", "author"]
+COLUMNS = ["method", "level", "policy", "training", "author", "revision"]
 SCORES = [f"{what}_{noise}" for noise in NOISES for what in ("success", "gentle")]
 TOLERANCE = 1.0  # percentage points, six trials of 600
 
@@ -96,7 +100,8 @@ def main() -> None:
         raise SystemExit("\n".join(wrong) or 0)
     if not args.method or not args.policy:
         raise SystemExit("add needs --method and --policy")
-    new = {name: getattr(args, name) for name in COLUMNS} | score(args.policy, args.level)
+    new = {name: getattr(args, name) for name in COLUMNS[:-1]} | {"revision": crane_env.REVISION}
+    new |= score(args.policy, args.level)
     same = [row for row in rows if (row["method"], row["level"]) == (args.method, args.level)]
     rows = [row for row in rows if row not in same] + [new]
     unfinished = args.board.with_suffix(".tmp")

@@ -172,8 +172,10 @@ export class Crane {
     return s[8] - (LOG_LENGTH / 2) * up - (this.diameter / 2) * Math.sqrt(1 - up ** 2);
   }
 
-  // Rules of the task after each decision. result stays "" until the time is up.
+  // The rule of success after each decision. result stays "" until the time is up. The rules that
+  // end an episode early in crane_env.py (joint limits, overspeed, log too far) are not here.
   judge() {
+    if (this.result) return;
     this.refresh();
     const s = this.data.sensordata;
     const { delta, psi } = this.relativePose();
@@ -183,7 +185,7 @@ export class Crane {
     this.streaks = this.streaks.map((n, i) => (good[i] ? n + 1 : 0));
     const safe = this.streaks.every((n) => n >= HOLD_DECISIONS);
     if (safe) this.up = Math.min(this.up, this.time);
-    if (this.result || this.time < TIME_LIMIT - 1e-9) return;
+    if (this.time < TIME_LIMIT - 1e-9) return;
     const failed = ["not lifted", "not held", "off centre"].find((_, i) => this.streaks[i] < 6);
     this.result = this.reached > 6 ? "not reached in 6 s" : failed ? failed : "success";
   }

@@ -93,7 +93,11 @@ function shapeOf(model, g, types) {
 let bodies = [];
 
 function buildScene(mujoco, model) {
-  for (const { mesh } of bodies) scene.remove(mesh);
+  for (const { mesh } of bodies) {
+    scene.remove(mesh);
+    mesh.geometry.dispose();
+    mesh.material.dispose();
+  }
   bodies = [];
   for (let g = 0; g < model.ngeom; g++) {
     const shape = model.geom_group[g] > 2 ? null : shapeOf(model, g, mujoco.mjtGeom);
@@ -159,21 +163,17 @@ async function main() {
   const policy = await ort.InferenceSession.create("policy.onnx");
   const mujoco = await loadMujoco();
   const crane = new Crane(mujoco, (name) => files[name]);
-  let obs;
-  const restart = () => {
-    obs = crane.reset(diameter, start);
-    buildScene(mujoco, crane.model);
-  };
-  restart();
+  let again = true;
 
   window.addEventListener("keydown", (event) => {
+    if (event.repeat || event.metaKey || event.ctrlKey) return;
     const key = event.key.length === 1 ? event.key.toUpperCase() : event.key;
     held.add(key);
     if (key === "P") driver = driver === "you" ? "policy" : "you";
     if (key === "Enter") start = sampleStart();
     if (key === "ArrowUp") diameter = Math.min(0.8, diameter + 0.1);
     if (key === "ArrowDown") diameter = Math.max(0.3, diameter - 0.1);
-    if (["Enter", "Backspace", "ArrowUp", "ArrowDown"].includes(key)) restart();
+    if (["Enter", "Backspace", "ArrowUp", "ArrowDown"].includes(key)) again = true;
   });
   window.addEventListener("keyup", (event) => held.delete(event.key.toUpperCase()));
   window.addEventListener("blur", () => held.clear());
@@ -182,13 +182,18 @@ async function main() {
   let [before, owed] = [performance.now(), 0];
   window.crane = crane; // for the console
   for (;;) {
+    if (again) {
+      // here and not in the key's handler: a decision may be waiting for the policy there
+      again = false;
+      crane.reset(diameter, start);
+      buildScene(mujoco, crane.model);
+    }
     const now = await new Promise(requestAnimationFrame);
     owed = Math.min(owed + (now - before) / 1000, 0.1); // seconds of physics; slow machines slow down
     before = now;
     while (owed >= 0.005) {
       if (crane.steps % DECISION === 0 && driver === "policy") {
-        obs = crane.observe();
-        const input = new ort.Tensor("float32", obs, [1, 18]);
+        const input = new ort.Tensor("float32", crane.observe(), [1, 18]);
         actions = (await policy.run({ obs: input })).actions.data;
       } else if (driver === "you") {
         actions = LEVERS.map(([up, down]) => Number(held.has(up)) - Number(held.has(down)));
