@@ -57,6 +57,8 @@ METHODS = {
     "recurrent PPO": "recurrent_ppo_crane",
     "scripted": None,
 }
+SWEPT = {method: (method, "hydraulic") for method in METHODS}  # whose policies, made for what
+SWEPT["mPPO, made for randomized"] = ("mPPO", "randomized")
 SWEEPS = {  # what is changed, and to what
     "more dead time [s]": [0.0, 0.03, 0.06, 0.09, 0.12],
     "constant pose error [m]": [0.0, 0.05, 0.1, 0.15, 0.2, 0.3],
@@ -162,7 +164,7 @@ def draw(rows: list[dict[str, str]]) -> None:
     """One panel for each thing that is changed, one line for each method."""
     figure, panels = plt.subplots(1, len(SWEEPS), figsize=(16, 3.4), sharey=True)
     for what, panel in zip(SWEEPS, panels):
-        for method in METHODS:
+        for method in SWEPT:
             points = [r for r in rows if r["changed"] == what and r["method"] == method]
             if points:
                 x, y = ([float(r[key]) for r in points] for key in ("value", "success"))
@@ -207,11 +209,11 @@ def main(
             {"method": method, "changed": thing, "value": value, **protocol}
             for thing, values in SWEEPS.items()
             for value in values
-            for method in METHODS
+            for method in SWEPT
         ]
 
         def measure(job: dict) -> dict[str, float] | None:
-            found = policy_of(job["method"], "hydraulic")
+            found = policy_of(*SWEPT[job["method"]])
             with changed(job["changed"], job["value"]):
                 return None if found is None else judge(*found, "hydraulic", trials, seed)
 
