@@ -256,7 +256,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             video.append_data(frame(crane, corner, caption(crane, trial.info, driver)))
             if bar.n == 1:  # the first also compiles the shaders
                 minutes = frames * (time.time() - start) / 60
-                bar.write(f"a film of {frames} frames takes about {minutes:.1f} minutes")
+                bar.write(f"a film of up to {frames} frames takes {minutes:.1f} minutes at most")
             bar.update()
 
         crane.watch = watch

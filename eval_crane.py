@@ -218,9 +218,11 @@ class OwnPolicy:
         try:
             self.make = getattr(importlib.import_module(module), attribute)
             inspect.signature(self.make).bind()
-        except (ImportError, AttributeError, TypeError, ValueError, SyntaxError) as error:
+        except (TypeError, ValueError) as error:
             wanted = f"{attribute or 'it'} must be a class or function without arguments"
             raise SystemExit(f"--policy {name}: {error}; {wanted}") from None
+        except (ImportError, AttributeError, SyntaxError) as error:
+            raise SystemExit(f"--policy {name}: {error}") from None
         self.name = name
 
     def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True):
@@ -240,9 +242,11 @@ class OwnPolicy:
         except (TypeError, ValueError, RuntimeError):
             kind = type(actions).__name__
             raise SystemExit(f"--policy {self.name}: actions are a {kind}, no array") from None
-        if actions.shape != (len(obs), 6) or not np.isfinite(actions).all():
-            wanted = f"({len(obs)}, 6) finite numbers for observations {obs.shape}"
+        if actions.shape != (len(obs), 6):
+            wanted = f"({len(obs)}, 6) for observations {obs.shape}"
             raise SystemExit(f"--policy {self.name}: actions {actions.shape}, not {wanted}")
+        if not np.isfinite(actions).all():
+            raise SystemExit(f"--policy {self.name}: actions contain NaN or infinity")
         return actions, (policy, memory)
 
 

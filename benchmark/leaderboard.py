@@ -5,8 +5,9 @@
     python benchmark/leaderboard.py add --method "My method" --level ideal --policy model.zip
 
 `add` judges a policy and writes its row to benchmark/leaderboard.csv. `check` judges the policies
-of the rows again. It fails if a score differs by more than TOLERANCE: policies of the same weights
-differ by a trial or two between processors, through rounding.
+of the rows again, whose paths begin in the current folder. It fails if a score differs by more than
+TOLERANCE: policies of the same weights differ by a trial or two between processors, through
+rounding.
 """
 
 import csv
@@ -91,6 +92,8 @@ def main() -> None:
     rows = list(csv.DictReader(args.board.open())) if args.board.is_file() else []
     if args.what == "check" and not rows:
         raise SystemExit(f"{args.board} has no rows")
+    if rows and (missing := {*COLUMNS, *SCORES} - rows[0].keys()):
+        raise SystemExit(f"{args.board} is no leaderboard: it has no {', '.join(sorted(missing))}")
     if unknown := {row["level"] for row in rows} - LEVELS.keys():
         raise SystemExit(f"{args.board}: no level {', '.join(unknown)}; there are {list(LEVELS)}")
     if not args.board.parent.is_dir():

@@ -456,12 +456,12 @@ def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
     out = run_here("--policy", "my_module:Model", "--trials", "1", "--pose-noise", "none").out
     assert "mine (my_module:Model)" in out
     for policy, said in [
-        ("my_module:lost", r"actions \(4, 6\), not \(4, 6\) finite numbers"),
+        ("my_module:lost", "actions contain NaN or infinity"),
         ("my_module:needy", "missing a required argument: 'gain'; needy must be a class or"),
         ("my_module:dumb", "5 is no function"),
         ("my_module:empty", "actions are a NoneType, no array"),
         ("my_module:Bare", "predict must return actions and a state"),
-        ("my_module:wide", r"actions \(4, 7\), not \(4, 6\) finite numbers for observations"),
+        ("my_module:wide", r"actions \(4, 7\), not \(4, 6\) for observations"),
         ("my_module:nothing", "--policy my_module:nothing: .*nothing"),
         ("no_module:Policy", "--policy no_module:Policy: No module named 'no_module'"),
         ("scripetd", "--policy must be file, scripted, zero, random or my_module:MyPolicy"),
