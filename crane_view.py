@@ -265,8 +265,9 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             trial.info |= UNKNOWN
             while not trial.ended:
                 trial.advance(policy, not args.stochastic)
-            for _ in range(FPS // 2):  # half a second to read how it ended
-                video.append_data(frame(crane, corner, caption(crane, trial.info, driver)))
+            end = frame(crane, corner, caption(crane, trial.info, driver))
+            for _ in range(FPS // 2):  # half a second to read it
+                video.append_data(end)
     if corner is not None:
         corner.close()
     crane.close()

@@ -152,8 +152,8 @@ def test_leaderboard_scores_are_the_judges(monkeypatch):
     monkeypatch.setattr(subprocess, "run", fewer)
     scores = leaderboard.score("scripted", "hydraulic")
     assert set(scores) == set(leaderboard.SCORES)
-    assert scores["success_exact"] > 70 > scores["gentle_exact"]
-    assert scores["success_pose_errors"] > 70 > scores["gentle_pose_errors"]
+    assert scores["success_exact"] > scores["gentle_exact"] > 0
+    assert scores["success_pose_errors"] > scores["gentle_pose_errors"] > 0
 
 
 def test_the_notebook_is_the_tutorial():
@@ -165,7 +165,7 @@ def test_the_notebook_is_the_tutorial():
 
 @pytest.mark.slow
 def test_the_notebook_runs(tmp_path, monkeypatch):
-    """From top to bottom, with shorter trainings, fewer trials and a smaller film."""
+    """From top to bottom, with shorter trainings, fewer trials and no film."""
     for name in ("assets", "docs"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=lambda *_: {"play", "figures"})
     for path in ROOT.glob("*.py"):
@@ -174,7 +174,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     for whole, short in [
         ("300000", "2048 --eval-every 1 --eval-trials 1 --final-trials 0"),
         ("--pose-noise none", "--pose-noise none --trials 1"),
-        ("--diameters 0.5", "--diameters 0.5 --width 64"),
+        ("--video first.mp4 --diameters 0.5", "--trials 1 --json"),  # test_eval.py makes films
     ]:
         assert whole in text
         text = text.replace(whole, short)
@@ -186,7 +186,6 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     for wanted in (
         "policy saved to",
         "2048 decisions: 0 %",
-        "1 trials filmed in first.mp4",
         "runs/ForestryCrane-v0__no_ground",
         "runs/ForestryCrane-v0__silu",
         "on delayed_crane:DelayedCrane-v0",

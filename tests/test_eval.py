@@ -342,8 +342,8 @@ def test_video(tmp_path, run_here, monkeypatch, kind):
     assert f"2 trials filmed in {film}" in run_here(*line).out
     frames = imageio.mimread(film, memtest=False)
     assert frames[0].shape[:2] == (72, 128) and np.std(frames[0]) > 10
-    # 20 frames a second, two a decision; a .gif leaves out frames that are as the one before
-    assert len(frames) == 32 if kind == "mp4" else 2 <= len(frames) <= 32
+    # 20 frames a second and ten of the end; a .gif leaves out frames that are as the one before
+    assert len(frames) == 2 * (16 + 10) if kind == "mp4" else 2 <= len(frames) <= 52
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50  # of another trial
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
