@@ -221,7 +221,8 @@ class Trial:
     def __init__(self, crane: CraneVectorEnv, seed: Any, diameter: float):
         self.crane, self.state, self.ended = crane, None, False
         crane.fixed_diameter = np.array([diameter])
-        self.obs, self.info = crane.reset(seed=[seed])
+        self.obs, info = crane.reset(seed=[seed])
+        self.info = info | UNKNOWN
 
     def advance(self, policy: Any, deterministic: bool = True) -> None:
         """Go on by a decision. After the end `info` stays that of the end."""
@@ -262,7 +263,6 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
         crane.watch = watch
         for diameter, seed in zip(diameters, seeds):
             trial = Trial(crane, seed, diameter)
-            trial.info |= UNKNOWN
             while not trial.ended:
                 trial.advance(policy, not args.stochastic)
             end = frame(crane, corner, caption(crane, trial.info, driver))
@@ -325,7 +325,6 @@ def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     def new_trial() -> Trial:
         seed = monte_carlo_trials(args.seed, number + 1, [diameter])[1][-1]
         trial = Trial(crane, seed, diameter)
-        trial.info |= UNKNOWN
         window.text = caption(crane, trial.info, names[0])
         return trial
 

@@ -28,6 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import tyro
+from leaderboard import LEVELS
 from mujoco import MjModel
 from tqdm import tqdm
 from tyro.conf import Positional
@@ -45,11 +46,6 @@ from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 HERE = Path(__file__).parent
 POLICIES = HERE.parent / "assets" / "policies"
 FIGURE = HERE.parent / "assets" / "figures" / "robustness.svg"
-LEVELS = {
-    "ideal": "ForestryCrane-v0",
-    "hydraulic": "ForestryCraneHydraulic-v0",
-    "randomized": "ForestryCraneRandomized-v0",
-}
 METHODS = {
     "mPPO": "mppo_beta_crane",
     "PPO": "ppo_crane",
