@@ -301,7 +301,7 @@ MUTATIONS = [
 def run_tests(folder: Path, tests: str) -> int:
     """Exit status of pytest: 0 if all pass, 1 if some fail."""
     name, *words = tests.split(" -k ")
-    line = [sys.executable, "-m", "pytest", "-x", "-q", f"tests/{name}.py"]
+    line = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", f"tests/{name}.py"]
     line += ["-k", words[0]] if words else []
     return subprocess.run(line, cwd=folder, capture_output=True).returncode
 
