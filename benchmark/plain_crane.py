@@ -1,7 +1,6 @@
 """One crane in plain MuJoCo calls: what throughput.py gives to Gymnasium and Stable-Baselines3.
 
-`NumpyCrane` computes observation, reward and rules in the usual way, with NumPy on small arrays.
-`PlainCrane` computes them without NumPy, which is faster. Both call the engine in the same way.
+`PlainCrane` computes observation, reward and rules without NumPy, which is slow on small arrays.
 """
 
 import sys
@@ -178,84 +177,15 @@ class PlainCrane(gymnasium.Env):
         return np.array([*q, *dq, x, y, z, angle], np.float32), reward, d_combine, distance, q, dq
 
 
-class NumpyCrane(PlainCrane):
-    """PlainCrane with command, observation, reward and limits in NumPy on small arrays."""
-
-    def __init__(self, frame_skip: int = 20):
-        super().__init__(frame_skip)
-        self.speeds, self.limits = np.array(self.speeds).T, np.array(self.limits).T
-
-    def _command(self, action: np.ndarray) -> np.ndarray:
-        action = np.clip(action, -1.0, 1.0)
-        command = np.where(action < 0, -action * self.speeds[0], action * self.speeds[1])
-        self.ctrl[:] = np.tile(command[machine.COMMAND_OF_SERVO], 2)
-        return command
-
-    def _clamp(self) -> None:
-        position = self.qpos[machine.SERVOS]
-        self.act[:] = np.clip(self.act, position - self.lead, position + self.lead)
-
-    def _look_for_hits(self) -> None:
-        force = np.linalg.norm(self.ground_force.reshape(5, 3), axis=-1)
-        self.hit = np.maximum(self.hit, force.max())
-
-    def _within_limits(self, q: np.ndarray, dq: np.ndarray) -> bool:
-        low, high = self.limits
-        q = q[crane_task.LIMITED]
-        slow = np.all((2 * self.speeds[0] <= dq) & (dq <= 2 * self.speeds[1]))
-        return bool(slow and np.all((low <= q) & (q <= high)))
-
-    def _observe(self, command: np.ndarray) -> tuple:
-        q, dq = self.qpos[self.q_at], self.qvel[self.dq_at]
-        centre, axis, log_centre, log_axis = self.sensordata[:12].reshape(4, 3)
-        delta_p = log_centre - centre
-        distance, miss = np.linalg.norm(delta_p), np.dot(delta_p, log_axis)
-        level = log_axis[:2] / np.maximum(np.linalg.norm(log_axis[:2]), 1e-9)
-        dot, cross = np.dot(axis[:2], level), axis[0] * level[1] - axis[1] * level[0]
-        angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
-        slew = (np.arctan2(log_centre[1], log_centre[0]) - q[0] + np.pi) % (2 * np.pi) - np.pi
-        rotator = q[6] + slew - angle
-        if np.abs(rotator) > crane_task.ROTATOR_MAX:
-            angle += np.pi * np.sign(rotator)
-        delta_p[2] += (crane_task.D_MAX - self.diameter) / 2
-        away = 1.0 - np.minimum(np.abs(dot), 1.0)
-        d_combine = np.linalg.norm(delta_p) + away
-        aim = np.linalg.norm(delta_p + [0, 0, crane_task.CLOSING_HEIGHT]) + away
-
-        up = np.minimum(np.abs(log_axis[2]), 1.0)
-        below = crane_task.LOG_LENGTH / 2 * up + self.diameter / 2 * np.sqrt(1 - up**2)
-        clearance = np.maximum(log_centre[2] - below, 1e-9)
-        beyond = crane_task.NEAR_SHARPNESS * (aim - crane_task.REACH_DISTANCE)
-        grasp = np.minimum(1.0, np.exp(-beyond)) * np.exp(-((miss / crane_task.GRAPPLE_MISS) ** 2))
-        height = np.sqrt(np.minimum(clearance, 1 / clearance))
-        centred = np.exp(-((miss / crane_task.LIFT_MISS) ** 2))
-        lift = centred * height
-        reward = np.exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
-        hardness = np.clip(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0, 1)
-        reward -= crane_task.GROUND_WEIGHT * hardness
-        reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
-        if np.all(self.sensordata[12:14] > 0):
-            calm = 1 - np.tanh(np.linalg.norm(command[:5]))
-            reward += crane_task.BALANCE_WEIGHT * calm * lift
-            support, pressure = self.sensordata[14:20].reshape(2, 3)
-            on_ground = np.linalg.norm(support) + np.linalg.norm(pressure)
-            carried = np.clip(1 - on_ground / self.weight, 0, 1)
-            reward += crane_task.CARRY_WEIGHT * centred * carried
-        c, s = np.cos(q[0]), np.sin(q[0])
-        along = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ delta_p
-        obs = np.concatenate([q, dq, along, [angle]]).astype(np.float32)
-        return obs, float(reward), d_combine, distance, q, dq
-
-
 def disagreement(
-    make: type[PlainCrane], policy: Any, options: crane_options.Options, frame_skip: int
+    policy: Any, options: crane_options.Options, frame_skip: int
 ) -> tuple[float, float]:
-    """Largest difference of an observation and of a reward between `make` and CraneVectorEnv.
+    """Largest difference of an observation and of a reward from those of CraneVectorEnv.
 
     Two whole episodes are driven by the policy, which grips and lifts in them, and two by noise.
     """
     envs = crane_env.CraneVectorEnv(4, **{**options, "frame_skip": frame_skip})
-    plain = [make(frame_skip) for _ in range(4)]
+    plain = [PlainCrane(frame_skip) for _ in range(4)]
     obs, _ = envs.reset(seed=list(range(4)))
     ours = [env.reset(seed=i)[0] for i, env in enumerate(plain)]
     ended, state, worst = np.zeros(4, bool), None, np.abs(obs - ours).max()
@@ -268,7 +198,7 @@ def disagreement(
         for i in np.flatnonzero(~ended):
             its_obs, reward, *ends, _ = plain[i].step(actions[i])
             if ends != [terminated[i], truncated[i]]:
-                sys.exit(f"{make.__name__} ends otherwise, at decision {decision}")
+                sys.exit(f"PlainCrane ends otherwise, at decision {decision}")
             worst = max(worst, np.abs(its_obs - obs[i]).max())
             worst_reward = max(worst_reward, abs(reward - rewards[i]))
             ended[i] = any(ends)
