@@ -11,6 +11,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
+LEVELS = ["ideal", "hydraulic", "randomized"]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -26,10 +27,9 @@ def table(header: list[str], rows: list[list[str]]) -> str:
 
 def leaderboard() -> str:
     """Every row of the leaderboard, level by level, the best first."""
-    order = {"ideal": 0, "hydraulic": 1, "randomized": 2}
     ranked = sorted(
         rows_of("leaderboard.csv"),
-        key=lambda row: (order[row["level"]], -float(row["gentle_exact"])),
+        key=lambda row: (LEVELS.index(row["level"]), -float(row["gentle_exact"])),
     )
     columns = ["level", "method", "success_exact", "gentle_exact"]
     columns += ["success_pose_errors", "gentle_pose_errors", "training"]
@@ -39,7 +39,7 @@ def leaderboard() -> str:
 
 
 def results() -> str:
-    """README's table: our methods on all levels, and the paper."""
+    """README's table: our methods and the paper's, exact pose, success and gentle by level."""
     scripts = {
         "mPPO": "`mppo_beta_crane.py`",
         "PPO": "`ppo_crane.py`",
@@ -47,14 +47,18 @@ def results() -> str:
         "recurrent PPO": "`recurrent_ppo_crane.py`",
         "scripted": "`scripted_crane.py`, no learning",
     }
-    rows = []
+    scores = {}
     for row in rows_of("leaderboard.csv"):
-        if row["method"] in scripts:
-            scores = [row["success_exact"], row["gentle_exact"], row["success_pose_errors"]]
-            rows.append([row["level"], scripts[row["method"]], *scores])
-    rows.append(["ideal", "paper, mPPO", "96.3", "", "91.8"])
-    rows.sort(key=lambda row: ["ideal", "hydraulic", "randomized"].index(row[0]))
-    return table(["level", "policy", "exact log pose", "gentle", "with pose errors"], rows)
+        scores[row["method"], row["level"]] = [row["success_exact"], row["gentle_exact"]]
+    rows = []
+    for method, name in scripts.items():
+        cells = [scores.get((method, level), ["", ""]) for level in LEVELS]
+        rows.append([name, *sum(cells, [])])
+    rows.append(["paper, mPPO", "96.3", "", "", "", "", ""])
+    header = ["policy"]
+    for level in LEVELS:
+        header += [level, "gentle"]
+    return table(header, rows)
 
 
 def shipped() -> str:
@@ -83,15 +87,14 @@ def seeds() -> str:
         lines.append(
             [level, method, decisions, ", ".join(r["training_seed"] for r in mine), *scores]
         )
-    return table(
-        ["level", "method", "decisions", "seeds", "success", "mean", "gentle", "mean"], lines
-    )
+    lines.sort(key=lambda line: LEVELS.index(line[0]))
+    header = ["level", "method", "decisions", "seeds", "success", "mean", "gentle", "mean"]
+    return table(header, lines)
 
 
 def matrix() -> str:
     """Success and gentle success of each policy of training seed 1 on each level."""
     rows = [row for row in rows_of("levels.csv") if row["seed"] == "1"]
-    levels = ["ideal", "hydraulic", "randomized"]
     lines = []
     for method, trained_on in dict.fromkeys((row["method"], row["trained_on"]) for row in rows):
         cells = {}
@@ -99,8 +102,9 @@ def matrix() -> str:
             if (row["method"], row["trained_on"]) == (method, trained_on):
                 success, gentle = float(row["success"]), float(row["gentle"])
                 cells[row["judged_on"]] = f"{success:.1f} / {gentle:.1f}"
-        lines.append([method, trained_on, *[cells[level] for level in levels]])
-    return table(["method", "made for", *[f"judged on {level}" for level in levels]], lines)
+        lines.append([method, trained_on, *[cells[level] for level in LEVELS]])
+    lines.sort(key=lambda line: LEVELS.index(line[1]))
+    return table(["method", "made for", *[f"judged on {level}" for level in LEVELS]], lines)
 
 
 def costs() -> str:
@@ -120,7 +124,7 @@ def costs() -> str:
         "oil [l]",
         "up [s]",
     ]
-    return table(header, sorted(lines, key=lambda line: line[0] != "ideal"))
+    return table(header, sorted(lines, key=lambda line: LEVELS.index(line[0])))
 
 
 TABLES = {

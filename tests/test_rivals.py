@@ -1,0 +1,86 @@
+"""benchmark/rivals.py: its clock, its cranes and its table."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "benchmark"))
+
+import rivals  # noqa: E402
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The time in s, which passes only where a test says so."""
+    now = [1000.0]
+    monkeypatch.setattr(rivals.time, "time", lambda: now[0])
+    return now
+
+
+def test_the_clock_stops_while_it_judges_and_ends_the_training(monkeypatch, now):
+    def judged_for_a_minute(policy, *protocol):
+        now[0] += 60
+        return {"success_rate": 0.5, "gentle_rate": 0.25}
+
+    monkeypatch.setattr(rivals.crane_trials, "evaluate", judged_for_a_minute)
+    clock = rivals.Clock(started=990.0, limit=100.0, threads=1)  # 10 s went into imports
+    with pytest.raises(rivals.TimeUp):
+        for _ in range(1000):
+            clock.tick()
+            clock.decisions += 64
+            now[0] += 1
+    minutes, decisions, success, gentle = zip(*clock.rows)
+    assert minutes == (0.5, 1.0, 1.5, 1.67)  # 30, 60, 90 and 100 s
+    assert decisions == (64 * 20, 64 * 50, 64 * 80, 64 * 90)
+    assert set(success) == {50.0} and set(gentle) == {25.0}
+
+
+def test_a_long_update_is_judged_once(monkeypatch, now):
+    scores = {"success_rate": 0.0, "gentle_rate": 0.0}
+    monkeypatch.setattr(rivals.crane_trials, "evaluate", lambda *_: scores)
+    clock = rivals.Clock(started=1000.0, limit=600.0, threads=1)
+    now[0] += 100  # three judgements would have been due
+    clock.tick()
+    clock.tick()
+    assert [row[0] for row in clock.rows] == [1.67]
+
+
+def test_the_cranes_of_our_settings_get_harder_with_the_time(now):
+    clock = rivals.Clock(started=1000.0, limit=100.0, threads=1)
+    easy = rivals.TimedCranes(rivals.Setting({}, cranes=2, like_mppo=True), clock)
+    plain = rivals.TimedCranes(rivals.Setting({}, cranes=2), clock)
+    (first, _), (second, _) = easy.reset(seed=1), plain.reset(seed=1)
+    np.testing.assert_array_equal(first, second)
+    now[0] += 20  # half of the easy time
+    actions = np.zeros((2, 6))
+    scaled, full = easy.step(actions)[1], plain.step(actions)[1]
+    assert easy.unwrapped.difficulty == pytest.approx(0.5)
+    assert plain.unwrapped.difficulty == 1.0
+    np.testing.assert_allclose(scaled, 0.06 * full)
+    assert clock.decisions == 4
+
+
+def test_every_setting_has_a_rival():
+    for settings in rivals.SETTINGS.values():
+        assert settings.keys() <= rivals.RIVALS.keys()
+    assert rivals.PUBLISHED.keys() == rivals.RIVALS.keys()
+
+
+def test_the_table_takes_the_last_judgement_before_each_time(tmp_path, capsys):
+    path = tmp_path / "rivals.csv"
+    rows = [
+        "a,ours,1,10.0,0.5,100,0,0",
+        "a,ours,1,10.0,4.0,900,50,10",
+        "a,ours,1,10.0,10.1,3000,90,30",
+        "a,ours,2,10.0,10.0,1000,70,50",
+        "a,ours,3,0.7,0.7,9,99,99",  # a try: not of these minutes
+    ]
+    path.write_text("\n".join([",".join(rivals.COLUMNS), *rows]) + "\n")
+    rivals.print_table(path, 10.0)
+    printed = capsys.readouterr().out.splitlines()[-1]
+    # of seeds 1 and 2: 0 and nothing yet at 2 min, 50 and nothing at 4, 6, 8 min
+    scores = "0.0 | 25.0 | 25.0 | 25.0 | 80.0 | 70.0 | 90.0 | 40.0"
+    assert printed == f"| a | ours | 2 | 2,000 | {scores} |"
