@@ -86,7 +86,7 @@ class Sizes(NamedTuple):
     num_steps: int  # decisions per crane and rollout
 
 
-FULL = Sizes(5, 90, (1, 64, 256), (1, 16), 128)  # 90 decisions: an episode
+FULL = Sizes(3, 90, (1, 64, 256), (1, 16), 128)  # 90 decisions: an episode
 QUICK = Sizes(2, 3, (1, 64), (1, 2), 8)
 
 
