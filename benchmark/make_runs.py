@@ -3,7 +3,8 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
     python benchmark/make_runs.py levels      # the same on the two harder levels; 12 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
-    python benchmark/make_runs.py timed       # mPPO, three seeds, one at a time; half an hour
+    python benchmark/make_runs.py timed       # mPPO, one at a time: three seeds of the ideal level,
+                                              # one of each harder level; 1.5 hours
     python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of `curves` and `timed`
 
 Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
@@ -129,6 +130,10 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed", "eva
     elif what == "timed":
         often += ["--eval-trials", "100"]
         jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
+        jobs += [
+            (SCRIPTS[0], f"{SCRIPTS[0]}_{level}", 1, [*often, *flags.split()], 2)
+            for level, flags in LEVELS.items()
+        ]
     else:
         jobs = [
             (script, name, seed, [*SHORT, *flags.split()], 1)
