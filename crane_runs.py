@@ -98,7 +98,8 @@ def read_arguments(algorithm: str, arguments: type, description: str) -> tuple[A
     if batch_size > MAX_BATCH:
         raise SystemExit(f"--num-envs times --num-steps must be at most {MAX_BATCH:,}")
     if checkpoint and checkpoint["iteration"] > max(1, args.total_timesteps // batch_size):
-        raise SystemExit("--resume: more --total-timesteps than these are done already")
+        done = checkpoint["iteration"] * batch_size
+        raise SystemExit(f"--resume: {done:,} decisions are done; raise --total-timesteps above it")
     return args, checkpoint
 
 
