@@ -11,6 +11,7 @@ evaluations, on the machine of the run.
 """
 
 import csv
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -18,6 +19,10 @@ import make_runs
 import numpy as np
 import plot_curves
 from plot_curves import PAPER, Run, read, recorded
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import eval_crane
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -168,9 +173,7 @@ def timed() -> str:
         for run in runs:
             numbers = [run["decisions"][-1] / 1e6, run["minutes"][-1], kept_after(run)]
             cells = [joined([x], digits) for x, digits in zip(numbers, (2, 1, 1))]
-            lines.append(
-                [level, run["seed"], *cells, f"{100 * run['final_success_rate'][-1]:.1f}"]
-            )
+            lines.append([level, run["seed"], *cells, f"{100 * run['final_success_rate'][-1]:.1f}"])
     header = ["level", "seed", "decisions [million]", "training [min]"]
     return table([*header, "96.3 % kept after [min]", "success at the end [%]"], lines)
 
@@ -185,13 +188,29 @@ def algorithms() -> str:
         line = [name]
         for noise in noises:
             mine = [r for r in rows if (r["run"], r["pose_noise"]) == (run, noise)]
-            means = [float(row["mean"]) for row in mine]
+            means = [float(row["success"]) for row in mine]
             line += [joined(means, 1), f"{np.mean(means):.1f}"]
         lines.append(line)
     paper = [cell for title in noises.values() for cell in ("", f"{100 * PAPER[title]:.1f}")]
     lines.append(["paper, mPPO", *paper])
     header = ["exact pose: seeds 1, 2, 3", "mean", "pose errors: seeds 1, 2, 3", "mean"]
     return table(["policy", *header], lines)
+
+
+def paper() -> str:
+    """Tables I and II of the paper beside evaluations.csv: mPPO, training seed 1."""
+    rows = [r for r in rows_of("evaluations.csv") if r["run"] == "curves_mppo_beta_crane"]
+    exact, errors = (row for row in rows if row["seed"] == "1")
+    lines = []
+    for d in eval_crane.PAPER["none"]:
+        printed = [str(eval_crane.PAPER[noise][d]) for noise in ("none", "step")]
+        ours = [f"{float(row[f'{d} m']):.0f}" for row in (exact, errors)]
+        lines.append([str(d), printed[0], ours[0], printed[1], ours[1]])
+    means = [f"{float(row['success']):.1f}" for row in (exact, errors)]
+    lines.append(["mean", f"{100 * PAPER['Table I']:.1f}", means[0]])
+    lines[-1] += [f"{100 * PAPER['Table II']:.1f}", means[1]]
+    header = ["d [m]", "paper, Table I", "here", "paper, Table II", "here"]
+    return table(header, lines)
 
 
 def learning() -> str:
@@ -235,6 +254,7 @@ TABLES = {
     "costs": costs,
     "timed": timed,
     "algorithms": algorithms,
+    "paper": paper,
     "learning": learning,
     "ablations": ablations,
 }

@@ -32,7 +32,7 @@ HERE = Path(__file__).parent
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
 LEVELS = {  # flags by name
     "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 1536000",
-    "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000",
+    "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000 --warm-up 0.15",
 }
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
@@ -84,7 +84,10 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
 
 
 def evaluate() -> None:
-    """Write the success [%] of all finished runs in benchmark/runs by diameter: evaluations.csv."""
+    """Write the success [%] of all finished runs in benchmark/runs to evaluations.csv.
+
+    One column a diameter, then the means of success and of gentle success.
+    """
     path, rows = HERE / "evaluations.csv", {}
     if path.exists():
         with open(path) as file:  # runs that are not in benchmark/runs keep their rows
@@ -107,7 +110,9 @@ def evaluate() -> None:
             row = {"run": name, "seed": seed, "pose_noise": noise}
             for cell in result["cells"]:
                 row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
-            rows[name, seed, noise] = row | {"mean": round(100 * result["mean_success_rate"], 2)}
+            for score in ("success", "gentle"):
+                row[score] = round(100 * result[f"mean_{score}_rate"], 2)
+            rows[name, seed, noise] = row
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, next(iter(rows.values())))
         writer.writeheader()
