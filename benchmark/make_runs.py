@@ -37,8 +37,8 @@ LEVELS = {  # flags by name
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
 # Script and flags by name. At another decision rate the number of simulation steps, updates and
-# minibatches stays the same. Commit c228fe1 is the last one with the flags of perturb_rpo and
-# no_bootstrap. Their CSV files stay.
+# minibatches stays the same. The CSV files of perturb_rpo, no_bootstrap and curriculum stay: their
+# flags are gone.
 ABLATIONS = {
     "default": ("mppo_beta_crane", ""),
     "reward_paper": ("mppo_beta_crane", "--env.reward paper"),
