@@ -27,12 +27,19 @@ import eval_crane
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 LEVELS = ["ideal", "hydraulic", "randomized"]
+DECISIONS = {"ideal": "1.02", "hydraulic": "1.54", "randomized": "4.10"}  # million
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def rows_of(name: str) -> list[dict[str, str]]:
     with (HERE / name).open() as file:
         return list(csv.DictReader(file))
+
+
+def evaluations(run: str, noise: str) -> list[dict[str, str]]:
+    """The rows of a run in evaluations.csv, one a seed."""
+    rows = rows_of("evaluations.csv")
+    return [row for row in rows if (row["run"], row["pose_noise"]) == (run, noise)]
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
@@ -89,22 +96,21 @@ def shipped() -> str:
 
 
 def seeds() -> str:
-    """Success and gentle success of each training seed, level by level."""
-    rows = rows_of("level_seeds.csv")
+    """evaluations.csv: success and gentle success of each training seed, level by level."""
     lines = []
-    for level, method in dict.fromkeys((row["level"], row["method"]) for row in rows):
-        mine = [row for row in rows if (row["level"], row["method"]) == (level, method)]
-        scores = []
-        for name in ("success", "gentle"):
-            numbers = [float(row[name]) for row in mine]
-            scores += [", ".join(row[name] for row in mine), f"{sum(numbers) / len(numbers):.1f}"]
-        decisions = f"{int(mine[0]['decisions']) / 1e6:.2f} million"
-        lines.append(
-            [level, method, decisions, ", ".join(r["training_seed"] for r in mine), *scores]
-        )
-    lines.sort(key=lambda line: LEVELS.index(line[0]))
-    header = ["level", "method", "decisions", "seeds", "success", "mean", "gentle", "mean"]
-    return table(header, lines)
+    for level in LEVELS:
+        for script, method in plot_curves.LABELS.items():
+            run = f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
+            mine = [r for r in evaluations(run, "none") if r["gentle"]]
+            if not mine:
+                continue
+            line = [level, method, DECISIONS[level], ", ".join(row["seed"] for row in mine)]
+            for name in ("success", "gentle"):
+                numbers = [float(row[name]) for row in mine]
+                line += [joined(numbers, 1), f"{np.mean(numbers):.1f}"]
+            lines.append(line)
+    header = ["level", "method", "decisions [million]", "seeds"]
+    return table([*header, "success", "mean", "gentle", "mean"], lines)
 
 
 def matrix() -> str:
@@ -183,12 +189,11 @@ def algorithms() -> str:
     noises = {"none": "Table I", "step": "Table II"}
     names = {"timed_mppo_beta_crane": "`mppo_beta_crane.py`, two threads"}
     names |= {f"curves_{script}": f"`{script}.py`" for script in make_runs.SCRIPTS}
-    rows, lines = rows_of("evaluations.csv"), []
+    lines = []
     for run, name in names.items():
         line = [name]
         for noise in noises:
-            mine = [r for r in rows if (r["run"], r["pose_noise"]) == (run, noise)]
-            means = [float(row["success"]) for row in mine]
+            means = [float(row["success"]) for row in evaluations(run, noise)]
             line += [joined(means, 1), f"{np.mean(means):.1f}"]
         lines.append(line)
     paper = [cell for title in noises.values() for cell in ("", f"{100 * PAPER[title]:.1f}")]
@@ -199,8 +204,7 @@ def algorithms() -> str:
 
 def paper() -> str:
     """Tables I and II of the paper beside evaluations.csv: mPPO, training seed 1."""
-    rows = [r for r in rows_of("evaluations.csv") if r["run"] == "curves_mppo_beta_crane"]
-    exact, errors = (row for row in rows if row["seed"] == "1")
+    exact, errors = (evaluations("curves_mppo_beta_crane", noise)[0] for noise in ("none", "step"))
     lines = []
     for d in eval_crane.PAPER["none"]:
         printed = [str(eval_crane.PAPER[noise][d]) for noise in ("none", "step")]

@@ -5,9 +5,9 @@
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
     python benchmark/make_runs.py timed       # mPPO, one at a time: three seeds of the ideal level,
                                               # one of each harder level; 1.5 hours
-    python benchmark/make_runs.py evaluate    # 600 trials of seed 40000 of `curves` and `timed`
 
-Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
+Two trainings run at a time, with one thread each. The timed runs train alone, with two threads. All
+but the ablations are then judged in 600 trials of seed 40000: evaluations.csv.
 
 Run the script again to go on. It skips each run that has a CSV file in benchmark/curves/, levels/,
 ablations/ or timed/. It resumes an interrupted run from its checkpoint in benchmark/runs/. To make
@@ -18,6 +18,7 @@ import csv
 import json
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from subprocess import PIPE
@@ -29,6 +30,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 HERE = Path(__file__).parent
+WRITING = threading.Lock()  # of evaluations.csv
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
 LEVELS = {  # flags by name
     "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 1536000",
@@ -79,49 +81,44 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
         return f"{run_name}, seed {seed}: stopped, see {log.name}"
     Path(log.name).unlink()
     csv_path.parent.mkdir(exist_ok=True)
-    export(max(HERE.glob(f"runs/*__{run_name}__{seed}__*")), csv_path)
+    run = max(HERE.glob(f"runs/*__{run_name}__{seed}__*"))
+    if folder != "ablations":
+        evaluate(run_name, seed, run)
+    export(run, csv_path)
     return f"{csv_path.name} written"
 
 
-def evaluate() -> None:
-    """Write the success [%] of all finished runs in benchmark/runs to evaluations.csv.
+def evaluate(name: str, seed: int, run: Path) -> None:
+    """Judge a finished run in 600 trials of seed 40000: its rows of evaluations.csv, in %.
 
-    One column a diameter, then the means of success and of gentle success.
+    One row with the exact pose and one with pose errors: a column a diameter, then the means of
+    success and of gentle success.
     """
-    path, rows = HERE / "evaluations.csv", {}
-    if path.exists():
-        with open(path) as file:  # runs that are not in benchmark/runs keep their rows
-            rows = {tuple(row.values())[:3]: row for row in csv.DictReader(file)}
-    policies = []
-    for folder, script in [*(("curves", name) for name in SCRIPTS), ("timed", SCRIPTS[0])]:
-        for policy in sorted(HERE.glob(f"runs/*__{folder}_{script}__*/policy.pt")):
-            seed = policy.parent.name.split("__")[2]
-            if (HERE / folder / f"{script}_seed{seed}.csv").exists():  # finished
-                policies.append((f"{folder}_{script}", seed, policy))
-    if not policies:
-        sys.exit(
-            "benchmark/runs has no policies: delete CSVs of curves/ or timed/ and make those runs"
-        )
-    for name, seed, policy in tqdm(policies):
-        for noise in ("none", "step"):
-            command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(policy)]
-            command += ["--json", "--pose-noise", noise]
-            result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
-            row = {"run": name, "seed": seed, "pose_noise": noise}
-            for cell in result["cells"]:
-                row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
-            for score in ("success", "gentle"):
-                row[score] = round(100 * result[f"mean_{score}_rate"], 2)
-            rows[name, seed, noise] = row
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, next(iter(rows.values())))
-        writer.writeheader()
-        writer.writerows(rows.values())
+    path, rows, new = HERE / "evaluations.csv", {}, {}
+    for noise in ("none", "step"):
+        command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(run)]
+        command += ["--json", "--pose-noise", noise]
+        result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
+        row = {"run": name, "seed": str(seed), "pose_noise": noise}
+        for cell in result["cells"]:
+            row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
+        for score in ("success", "gentle"):
+            row[score] = round(100 * result[f"mean_{score}_rate"], 2)
+        new[name, str(seed), noise] = row
+    with WRITING:
+        if path.exists():
+            with open(path, newline="") as file:
+                rows = {tuple(row.values())[:3]: row for row in csv.DictReader(file)}
+        rows |= new
+        part = path.with_suffix(".part")
+        with open(part, "w", newline="") as file:
+            writer = csv.DictWriter(file, row)
+            writer.writeheader()
+            writer.writerows(rows[key] for key in sorted(rows))
+        part.replace(path)
 
 
-def main(what: Positional[Literal["curves", "levels", "ablations", "timed", "evaluate"]]) -> None:
-    if what == "evaluate":
-        return evaluate()
+def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) -> None:
     often = ["--eval-every", "25"]
     if what == "curves":
         jobs = [(name, name, seed, often, 1) for seed in (1, 2, 3) for name in SCRIPTS]
