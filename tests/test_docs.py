@@ -12,6 +12,7 @@ from pathlib import Path
 
 import nbclient
 import nbformat
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -43,6 +44,34 @@ def test_a_changed_number_is_noticed(monkeypatch):
     rows[0]["success_exact"] = "12.3"
     monkeypatch.setattr(fill_docs, "rows_of", lambda name: rows)
     assert fill_docs.filled(text) != text and "12.3" in fill_docs.filled(text)
+
+
+def run_of(success: list[float]) -> dict[str, np.ndarray]:
+    """Evaluations after 1, 2 ... minutes and million decisions, with updates between them."""
+    times = np.arange(2.0, 2 * len(success) + 2) / 2
+    rates = np.full(len(times), np.nan)
+    rates[::2] = success
+    return {"minutes": times, "decisions": 1e6 * times, "eval_success_rate": rates}
+
+
+@pytest.mark.parametrize(
+    "success, minutes",
+    [
+        ([0.5, 0.97, 0.94, 0.963, 0.95, 1.0], 4),  # the first 97 % is lost again
+        ([0.97, 0.962], 1),
+        ([0.5, 1.0], np.nan),  # the last one keeps nothing
+        ([0.962, 0.962, 0.962], np.nan),
+    ],
+)
+def test_when_a_run_keeps_the_papers_success(success, minutes):
+    np.testing.assert_equal(fill_docs.kept_after(run_of(success)), minutes)
+
+
+def test_crossing_lies_between_two_evaluations():
+    run = run_of([0.2, 0.8, 0.1, 0.9])
+    assert fill_docs.crossing(run, "decisions", 0.5) == pytest.approx(1.5)
+    assert fill_docs.crossing(run, "decisions", 0.2) == pytest.approx(1.0)
+    assert np.isnan(fill_docs.crossing(run, "decisions", 0.95))
 
 
 def test_all_modules_are_installed():
