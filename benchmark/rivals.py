@@ -409,7 +409,7 @@ def run_all(args: Args) -> None:
                 print(f"{name} failed", flush=True)
 
 
-def print_table(path: Path, budget: float) -> None:
+def results_table(path: Path, budget: float) -> str:
     """Success in %, mean over the seeds, after fifths of the time; the extremes at the end."""
     runs = defaultdict(lambda: defaultdict(list))
     with open(path, newline="") as file:
@@ -431,7 +431,7 @@ def print_table(path: Path, budget: float) -> None:
         gentle = np.mean([float(row["gentle"]) for row in last])
         cells += [str(min(scores)), str(max(scores)), f"{gentle:.1f}"]
         table.append(cells)
-    print("\n".join(f"| {' | '.join(cells)} |" for cells in table))
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in table)
 
 
 def main() -> None:
@@ -446,7 +446,7 @@ def main() -> None:
         args.results.write_text(",".join(COLUMNS) + "\n")
     if not args.table:
         run_all(args)
-    print_table(args.results, args.minutes)
+    print(results_table(args.results, args.minutes))
 
 
 if __name__ == "__main__":

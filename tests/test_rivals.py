@@ -69,7 +69,7 @@ def test_every_setting_has_a_rival():
     assert rivals.PUBLISHED.keys() == rivals.RIVALS.keys()
 
 
-def test_the_table_takes_the_last_judgement_before_each_time(tmp_path, capsys):
+def test_the_table_takes_the_last_judgement_before_each_time(tmp_path):
     path = tmp_path / "rivals.csv"
     rows = [
         "a,ours,1,10.0,0.5,100,0,0",
@@ -79,8 +79,7 @@ def test_the_table_takes_the_last_judgement_before_each_time(tmp_path, capsys):
         "a,ours,3,0.7,0.7,9,99,99",  # a try: not of these minutes
     ]
     path.write_text("\n".join([",".join(rivals.COLUMNS), *rows]) + "\n")
-    rivals.print_table(path, 10.0)
-    printed = capsys.readouterr().out.splitlines()[-1]
+    last = rivals.results_table(path, 10.0).splitlines()[-1]
     # of seeds 1 and 2: 0 and nothing yet at 2 min, 50 and nothing at 4, 6, 8 min
     scores = "0.0 | 25.0 | 25.0 | 25.0 | 80.0 | 70.0 | 90.0 | 40.0"
-    assert printed == f"| a | ours | 2 | 2,000 | {scores} |"
+    assert last == f"| a | ours | 2 | 2,000 | {scores} |"
