@@ -6,10 +6,10 @@
     python benchmark/rivals.py --table                          # the table of what is there
 
 Each run is a process of its own. Its clock starts with the process: imports and compilation count.
-The clock stops while a policy is judged. Every 30 s the mean action is judged in 120 trials of the
-full task, with the normalization of observations that the training has reached. If an update takes
-longer, the judge waits for its end. A finished run adds its rows to benchmark/rivals.csv and is not
-run again. A killed run leaves no rows.
+The clock stops while a policy is judged. Every minute the mean action is judged in 120 trials of
+the full task, with the normalization of observations that the training has reached. If an update
+takes longer, the judge waits for its end. A finished run adds its rows to benchmark/rivals.csv and
+is not run again. A killed run leaves no rows.
 
 Each rival has two settings. `published` is what its makers publish for continuous control:
 
@@ -60,7 +60,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "rivals.csv"
 COLUMNS = ["rival", "setting", "seed", "budget", "minutes", "decisions", "success", "gentle"]
 TASK, TRIALS, EVAL_SEED = "ForestryCrane-v0", 20, 10_000  # trials per log diameter
-EVERY = 30.0  # s between two judgements
+EVERY = 60.0  # s between two judgements
 ENDLESS = 10**9  # decisions or updates: the clock ends the training
 STARTED = "RIVALS_STARTED"  # environment variable of a run: time.time() before its process
 
