@@ -388,7 +388,10 @@ def test_clear_errors_of_damaged_policies(tmp_path, capsys):
 
     saved = torch.load(eval_crane.SHIPPED, weights_only=True)
     known = "mppo_beta, ppo, trpo, recurrent_ppo"
-    assert error_of(algorithm="sac") == f": unknown algorithm 'sac'; known: {known}"
+    gone = f": unknown algorithm 'sac'; known: {known}; its script sac.py is not in this folder"
+    assert error_of(algorithm="sac", script="sac.py") == gone
+    older = {"algorithm": "sac", "script": ""}  # files that do not name their script
+    assert error_of(**older) == f": unknown algorithm 'sac'; known: {known}"
     assert " does not fit mppo_beta: " in error_of(args=saved["args"] | {"hidden_sizes": (8, 8)})
     assert " does not fit mppo_beta: " in error_of(args=saved["args"] | {"warp": 9})
     assert " does not fit mppo_beta: " in error_of(weights=3)
