@@ -47,8 +47,8 @@ MIN_LEVER = 0.05  # m; below q2 = -1.1 rad the boom's two bars do not reach each
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
 # The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
 OIL = np.array(
-    [[6.362e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
-     [6.362e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
+    [[12.724e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
+     [12.724e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
 LOG_DENSITY = 650.0  # kg/m^3
 # What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
