@@ -278,7 +278,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             obs[again] = starts[again]
             if self.autoreset_mode == AutoresetMode.NEXT_STEP:
                 reward[again], info["time_to_reach"][again] = 0.0, np.inf
-                for key, values in start_info.items():
+                for key, values in (start_info | self.costs.total).items():
                     info[key][again] = values[again]
         return obs, reward, terminated, truncated, info
 

@@ -42,7 +42,6 @@ BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes t
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
 PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
-MAX_PRESSURE = 25e6  # Pa, of the pump
 MIN_LEVER = 0.05  # m; below q2 = -1.1 rad the boom's two bars do not reach each other
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
 # The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
@@ -220,11 +219,12 @@ class Costs:
 
         ground (N, 5) in N at each of the last physics steps. All else is of the last one: q (N, 8),
         dq (N, 6) and force (N, 6) of the drives, in rad, m, s, N m and N. The pump gives every
-        joint its oil, at the pressure that the hardest of them needs.
+        joint its oil, at the pressure that the hardest of them needs. Force limits are the same in
+        both directions, so a joint that pushes with its rod side may need more than the real 25 MPa.
         """
         oil = oil_per_movement(q, dq)
         flow = np.sum(oil * np.abs(dq), axis=-1)
-        pressure = np.clip(force * np.sign(dq) / oil, 0, MAX_PRESSURE).max(axis=-1)
+        pressure = np.maximum(force * np.sign(dq) / oil, 0).max(axis=-1)
         swing = np.hypot(q[:, 4] - np.pi / 2 + q[:, 1] + q[:, 2], q[:, 5] - np.pi / 2)
         self.impact = np.maximum(self.impact, ground.max(axis=-1))
         total = self.total

@@ -304,13 +304,13 @@ def test_a_log_on_jaws_that_stand_on_the_ground_is_not_carried():
 
 
 def test_oil_of_a_steady_slew():
-    """Rack and pinion: 6.362e-4 m^3 for each radian."""
+    """Two cylinders of 6.362e-3 m^2 on a rack of 0.1 m."""
     envs = CraneVectorEnv(1)
     envs.reset(seed=0)
     before = envs.qpos[0, 0]
     for _ in range(20):
         _, _, _, _, info = envs.advance(np.array([[0.2, 0, 0, 0, 0, 0]]))
-    litres = 1000 * 6.362e-4 * abs(envs.qpos[0, 0] - before)
+    litres = 1000 * 12.724e-4 * abs(envs.qpos[0, 0] - before)
     assert info["litres"][0] == pytest.approx(litres, rel=0.05)
 
 
@@ -346,6 +346,24 @@ def test_costs_start_anew_with_an_episode_and_gentle_needs_both(monkeypatch):
     assert info["success"].all() and info["gentle"].tolist() == [True, False]
     assert (info["litres"] > 0.1).all() and np.max([*envs.costs.total.values()]) == 0
     assert info["time_up"].tolist() == [0.2, 0.2] and np.isinf(envs.time_up).all()
+
+
+def test_limits_of_the_joints_are_their_cylinders_at_the_highest_pressure():
+    """25 MPa on the piston side, where D says that a limit comes from it."""
+    model = machine.load_model(actuators="hydraulic")
+    limits = model.jnt_actfrcrange[machine.SERVOS, 1]
+    levers = machine.cylinder_levers(np.linspace(-1, 1, 50), np.linspace(-1, 1, 50))
+    assert limits[0] == pytest.approx(25e6 * machine.OIL[1, 0], rel=1e-3)  # slew
+    assert (25e6 * machine.OIL[1, 1] * levers[0]).max() > limits[1]  # boom
+
+
+def test_a_pushing_rod_side_gives_no_less_energy_than_work():
+    """A boom that pushes down as hard as it can, 1 rad/s for 1 s at its force limit."""
+    costs, limit = machine.Costs(1), 3.5e5
+    force, dq = np.zeros((1, 6)), np.zeros((1, 6))
+    force[0, 1], dq[0, 1] = -limit, -1.0
+    costs.add(np.zeros((1, 5)), np.zeros((1, 8)), dq, force, 1.0)
+    assert costs.total["work"][0] == costs.total["energy"][0] == pytest.approx(limit)
 
 
 # ---- randomize
