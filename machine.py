@@ -220,7 +220,7 @@ class Costs:
         ground (N, 5) in N at each of the last physics steps. All else is of the last one: q (N, 8),
         dq (N, 6) and force (N, 6) of the drives, in rad, m, s, N m and N. The pump gives every
         joint its oil, at the pressure that the hardest of them needs. Force limits are the same in
-        both directions, so a joint that pushes with its rod side may need more than the real 25 MPa.
+        both directions, so a joint that pushes with its rod side may need more than 25 MPa.
         """
         oil = oil_per_movement(q, dq)
         flow = np.sum(oil * np.abs(dq), axis=-1)

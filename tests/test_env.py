@@ -661,6 +661,7 @@ def test_next_step_autoreset():
             np.testing.assert_array_equal(mine, other)
         assert (reward[resting] == 0).all() and np.isinf(info["time_to_reach"][resting]).all()
         assert (info["termination"][resting] == "none").all() and "final_obs" not in info
+        assert (info["litres"][resting] == 0).all()
         np.testing.assert_array_equal(info["clearance"], expected[4]["clearance"])
         ends, rests = ends + terminated.sum() + truncated.sum(), rests + resting.sum()
     assert ends > 5 and rests == ends - (ours.resting).sum()
