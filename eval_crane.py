@@ -52,6 +52,17 @@ PAPER = {  # % of 100 trials per diameter in m
 }
 TITLES = {"none": "Table I, clean", "step": "Table II, pose noise", "episode": "Pose noise"}
 CRANES = 200  # simulated at once
+CARE_COLUMNS = [  # of the table of costs: heading, result, factor to the heading's unit, average
+    ("peak [kN]", "ground_peak", 1e-3, np.median),
+    ("impulse [kN s]", "ground_impulse", 1e-3, np.median),
+    ("> 20 kN [s]", "ground_time", 1.0, np.mean),
+    ("oil [l]", "litres", 1.0, np.median),
+    ("energy [kJ]", "energy", 1e-3, np.median),
+    ("work [kJ]", "work", 1e-3, np.median),
+    ("up [s]", "time_up", 1.0, np.median),
+    ("swing [rad]", "swing_peak", 1.0, np.median),
+    ("log [m/s]", "log_speed", 1.0, np.median),
+]
 
 
 @dataclass
@@ -127,6 +138,7 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         return load_sb3(path), {"env_id": "ForestryCrane-v0"}, "Stable-Baselines3"
     if path.suffix == ".onnx":
         policy = OnnxPolicy(path)
+        warn_of_revision(path, policy.task)
         return policy, policy.task, policy.algorithm
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
@@ -138,8 +150,7 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     if "frame_skip" not in task:
         raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
     task = crane_options.DEFAULTS | task  # older files do not know all options
-    if task["revision"] != crane_env.REVISION:
-        print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
+    warn_of_revision(path, task)
     try:
         bound = torch.ones(6)  # older files do not know their spaces, but all are the crane's
         older = {"obs_dim": len(weights["obs_mean"]), "low": -bound, "high": bound}
@@ -156,6 +167,11 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
             wrote = f"that of {saved['script']}, which wrote it"
             raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
     return agent, task, algorithm
+
+
+def warn_of_revision(path: Path, task: dict[str, Any]) -> None:
+    if task["revision"] != crane_env.REVISION:
+        print(f"{path} was trained on task revision {task['revision']}", file=sys.stderr)
 
 
 def load_sb3(path: Path) -> Any:
@@ -358,26 +374,22 @@ def print_table(records: list[dict], cells: list[dict], paper: dict, title: str)
 
 
 def print_care(records: list[dict], cells: list[dict]) -> None:
-    """What the trials cost: medians over all of them, of the time over the successes."""
-    print("\n| d [m] | gentle % | peak [kN] | oil [l] | energy [kJ] | up [s] | swing [rad] |")
-    print("|-------|----------|-----------|---------|-------------|--------|-------------|")
-    rows = [(f"{c['diameter']:<5}", lambda r, d=c["diameter"]: r["diameter"] == d) for c in cells]
-    for name, chosen in [*rows, ("all  ", lambda r: True)]:
-        trials = [r for r in records if chosen(r)]
-        peak, oil, energy, swing = (
-            np.median([r[key] for r in trials])
-            for key in ("ground_peak", "litres", "energy", "swing_peak")
-        )
-        up = [r["time_up"] for r in trials if r["success"]]
-        up = f"{np.median(up):.2f}" if up else ""
-        gentle = 100 * np.mean([r["gentle"] for r in trials])
-        print(
-            f"| {name} | {gentle:<8.1f} | {peak / 1e3:<9.1f} | {oil:<7.2f} | {energy / 1e3:<11.1f} "
-            f"| {up:<6} | {swing:<11.2f} |"
-        )
-    print("Gentle is success without more than 20 kN of the crane on the ground. Peak is that")
-    print("force. Up is the time until the log is safely up. All but gentle are medians, up over")
-    print("the successes.")
+    """What the trials cost, one row a diameter and one for all."""
+    heads = [head for head, *_ in CARE_COLUMNS]
+    print(f"\n| d [m] | gentle % | {' | '.join(heads)} |")
+    print(f"|-------|----------|{'|'.join('-' * (len(head) + 2) for head in heads)}|")
+    rows = [([r for r in records if r["diameter"] == c["diameter"]], c["diameter"]) for c in cells]
+    for trials, name in [*rows, (records, "all")]:
+        line = [f"{name:<5}", f"{100 * np.mean([r['gentle'] for r in trials]):<8.1f}"]
+        for head, key, factor, mean in CARE_COLUMNS:
+            values = [r[key] for r in trials if key != "time_up" or r["success"]]
+            number = f"{factor * mean(values):.2f}" if values else ""
+            line.append(f"{number:<{len(head)}}")
+        print(f"| {' | '.join(line)} |")
+    print("Gentle is success without more than 20 kN of the crane on the ground. Peak and impulse")
+    print("are of that force. Work is the drives' |force x speed|. Up is the time until the log is")
+    print("safely up, over the successes. Log is the log's speed at the end. Gentle and the time")
+    print("above 20 kN are means, all others are medians.")
 
 
 def check_combinations(args: Args) -> None:

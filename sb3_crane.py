@@ -2,7 +2,7 @@
 
     pip install stable-baselines3
 
-    import crane_env
+    import crane_trials
     from sb3_crane import CraneVecEnv
     from stable_baselines3 import SAC
     from stable_baselines3.common.vec_env import VecMonitor

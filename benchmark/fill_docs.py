@@ -130,22 +130,15 @@ def matrix() -> str:
 
 def costs() -> str:
     """What the trials of each policy cost on its own level."""
-    names = ["ground_peak_kN", "energy_kJ", "litres", "time_up_s"]
+    heads = [head for head, *_ in eval_crane.CARE_COLUMNS]
     lines = []
     for row in rows_of("levels.csv"):
         if row["trained_on"] == row["judged_on"] and row["seed"] == "1":
             lines.append(
-                [row["trained_on"], row["method"], *[f"{float(row[n]):.1f}" for n in names]]
+                [row["trained_on"], row["method"], *[f"{float(row[head]):.2f}" for head in heads]]
             )
-    header = [
-        "level",
-        "method",
-        "peak force on the ground [kN]",
-        "energy [kJ]",
-        "oil [l]",
-        "up [s]",
-    ]
-    return table(header, sorted(lines, key=lambda line: LEVELS.index(line[0])))
+    lines.sort(key=lambda line: LEVELS.index(line[0]))
+    return table(["level", "method", *heads], lines)
 
 
 def joined(numbers: Iterable[float], digits: int) -> str:
