@@ -40,8 +40,9 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = 30.0  # what r_ground takes away at GENTLE_FORCE, from nothing at half of it
+GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 60.0}  # what r_ground takes away at GENTLE_FORCE
 GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}  # times that at most: stiff servos only hit hard
+GROUND_RISE = {"ideal": 2, "hydraulic": 4}  # power of the difficulty: slow drives lift later
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]
@@ -196,7 +197,7 @@ def reward_terms(
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
         hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, GROUND_MOST[actuators])
-        r_ground = -GROUND_WEIGHT * difficulty**2 * hardness
+        r_ground = -GROUND_WEIGHT[actuators] * difficulty ** GROUND_RISE[actuators] * hardness
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 

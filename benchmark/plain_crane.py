@@ -164,7 +164,7 @@ class PlainCrane(gymnasium.Env):
         lift = centred * height
         reward = exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
         hardness = min(max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0), 1.0)
-        reward -= crane_task.GROUND_WEIGHT * hardness
+        reward -= crane_task.GROUND_WEIGHT["ideal"] * hardness
         reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if touch[0] > 0 and touch[1] > 0:
             calm = 1 - tanh(hypot(*command[:5]))

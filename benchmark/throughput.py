@@ -57,6 +57,7 @@ import crane_runs
 import crane_task
 import eval_crane
 from crane_env import CraneVectorEnv
+from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 try:
     import psutil
@@ -86,7 +87,7 @@ class Sizes(NamedTuple):
     num_steps: int  # decisions per crane and rollout
 
 
-FULL = Sizes(3, 90, (1, 64, 256), (1, 16), 128)  # 90 decisions: an episode
+FULL = Sizes(3, 90, (1, 64), (1, 16), 128)  # 90 decisions: an episode
 QUICK = Sizes(2, 3, (1, 64), (1, 2), 8)
 
 
@@ -186,6 +187,10 @@ def env_name(cranes: int = CRANES, threads: int = THREADS) -> str:
     return f"CraneVectorEnv {cranes} cranes, {threads} threads"
 
 
+def scripted_name(actuators: str) -> str:
+    return f"{env_name()}, {actuators} drives under the scripted crane"
+
+
 def cheap_cells(parts: tuple[str, ...], sizes: Sizes, policy: Any, options: dict) -> dict:
     """What to measure by turns: unit, repetitions and function of each key of Results."""
     cells = {}
@@ -200,10 +205,9 @@ def cheap_cells(parts: tuple[str, ...], sizes: Sizes, policy: Any, options: dict
         for what, run in runs.items():
             cells["physics", what, HELD_STEPS] = ("steps/s", sizes.repetitions, run)
 
-    def add(part: str, what: str, skip: int, n: int, make_envs: Callable) -> None:
-        repetitions = min(3, sizes.repetitions) if n > 64 else sizes.repetitions  # they take long
+    def add(part: str, what: str, skip: int, n: int, make_envs: Callable, policy=policy) -> None:
         run = partial(drive, make_envs, policy, sizes.decisions * max(1, 4 // n), skip)
-        cells[part, what, skip] = ("decisions/s", repetitions, run)
+        cells[part, what, skip] = ("decisions/s", sizes.repetitions, run)
 
     for skip in (20, 1):
         if "env" in parts:
@@ -211,6 +215,11 @@ def cheap_cells(parts: tuple[str, ...], sizes: Sizes, policy: Any, options: dict
                 own = {"frame_skip": skip, "env_threads": threads}
                 make = partial(CraneVectorEnv, n, **options | own)
                 add("env", env_name(n, threads), skip, n, make)
+            for actuators, settings in {"ideal": IDEAL, "hydraulic": HYDRAULIC}.items():
+                own = {"frame_skip": skip, "env_threads": THREADS, "actuators": actuators}
+                make = partial(CraneVectorEnv, CRANES, **options | own)
+                script = ScriptedCrane(settings=settings)
+                add("env", scripted_name(actuators), skip, CRANES, make, script)
         if "vector" in parts:
             same = {"autoreset_mode": AutoresetMode.SAME_STEP}  # as CraneVectorEnv
             for n in sizes.workers:
@@ -362,6 +371,10 @@ def ratios(results: Results) -> list[tuple[str, float, float | None]]:
             (f"env steps/s / {THREADS} x mj_step", skip * env(skip) / limit, env_bar),
             ("env / the better of Sync and AsyncVectorEnv", env(skip) / rival, None),
         ]
+        ideal, hydraulic = (
+            median("env", scripted_name(kind), skip) for kind in ("ideal", "hydraulic")
+        )
+        rows.append(("env with hydraulic drives / ideal drives", hydraulic / ideal, 0.8))
         for one, others, bar in [
             (ppo, ("SB3 PPO",), ppo_bar),
             (ppo, ("SB3 PPO on CraneVectorEnv",), None),

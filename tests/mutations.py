@@ -130,8 +130,8 @@ MUTATIONS = [
     Mutation(
         "an easy task punishes as the full one",
         ("crane_task.py",),
-        "-GROUND_WEIGHT * difficulty**2 *",
-        "-GROUND_WEIGHT *",
+        "* difficulty ** GROUND_RISE[actuators] *",
+        "*",
         "test_rules -k ground",
     ),
     Mutation(

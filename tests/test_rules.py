@@ -154,16 +154,18 @@ def test_carrying_the_log_pays_before_it_rises():
 def test_hitting_the_ground_costs():
     """From 10 to 20 kN, with hydraulic drives to 40; less in an easy task, nothing on paper."""
     here = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1])
-    for force, expected in [(0, 0), (10e3, 0), (15e3, -15), (20e3, -30), (40e3, -90), (50e3, -90)]:
-        terms = terms_of(here, 0.4, COMMAND, ground=np.array([force]), actuators="hydraulic")
-        assert terms[4] == pytest.approx(expected)
-        expected = max(expected, -30)
-        terms = terms_of(here, 0.4, COMMAND, ground=np.array([force]))
-        assert terms[4] == pytest.approx(expected)
-        easy = terms_of(here, 0.4, COMMAND, ground=np.array([force]), difficulty=0.5)
-        assert easy[4] == pytest.approx(expected / 4)
-        np.testing.assert_array_equal(terms[:4], terms_of(here, 0.4, COMMAND))
-        assert terms_of(here, 0.4, COMMAND, ground=np.array([force]), kind="paper")[4] == 0
+    for kN, ideal, hydraulic in [
+        (0, 0, 0), (10, 0, 0), (15, -15, -30), (20, -30, -60), (40, -30, -180), (50, -30, -180)
+    ]:  # fmt: skip
+        force = np.array([1e3 * kN])
+        for actuators, expected, ease in [("ideal", ideal, 4), ("hydraulic", hydraulic, 16)]:
+            given = {"ground": force, "actuators": actuators}
+            terms = terms_of(here, 0.4, COMMAND, **given)
+            assert terms[4] == pytest.approx(expected)
+            easy = terms_of(here, 0.4, COMMAND, **given, difficulty=0.5)
+            assert easy[4] == pytest.approx(expected / ease)
+            np.testing.assert_array_equal(terms[:4], terms_of(here, 0.4, COMMAND))
+        assert terms_of(here, 0.4, COMMAND, ground=force, kind="paper")[4] == 0
 
 
 def test_paper_reward():
