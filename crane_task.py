@@ -36,13 +36,13 @@ GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed
 LIFT_WEIGHT = 2.0  # largest staged r_lift
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
 CLOSING_HEIGHT = 0.1  # m above Delta_p = 0: closing jaws pull the grapple down, onto the ground
+EMPTY_GRIP = 0.5  # share of r_grapple that jaws without a log earn at most; a grip earns all
 NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
 GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 60.0}  # what r_ground takes away at GENTLE_FORCE
 GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}  # times that at most: stiff servos only hit hard
-GROUND_RISE = {"ideal": 2, "hydraulic": 4}  # power of the difficulty: slow drives lift later
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]
@@ -173,8 +173,9 @@ def reward_terms(
     command (N, 6) the commanded velocities in rad/s and m/s, ground (N,) the decision's largest
     force of crane on ground in N.
 
-    kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
-    the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
+    kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, most once
+    both jaws hold it, r_lift if the log is lifted there, and r_balance while both jaws hold it
+    (docs/environment.md says why).
     r_ground punishes hitting the ground. An easy task forgives it: a crane that does not lift yet
     would learn to stay away.
     """
@@ -188,16 +189,17 @@ def reward_terms(
         r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
     else:
         near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
-        r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
+        held = state.touching.all(axis=-1)
+        grip = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
+        r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * grip
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
         height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
-        held = state.touching.all(axis=-1)
         centred = np.exp(-((miss / LIFT_MISS) ** 2))
         lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
         hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, GROUND_MOST[actuators])
-        r_ground = -GROUND_WEIGHT[actuators] * difficulty ** GROUND_RISE[actuators] * hardness
+        r_ground = -GROUND_WEIGHT[actuators] * difficulty**2 * hardness
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 
