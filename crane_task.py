@@ -36,7 +36,7 @@ GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed
 LIFT_WEIGHT = 2.0  # largest staged r_lift
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
 CLOSING_HEIGHT = 0.1  # m above Delta_p = 0: closing jaws pull the grapple down, onto the ground
-EMPTY_GRIP = 0.5  # share of r_grapple that jaws without a log earn at most; a grip earns all
+EMPTY_GRIP = 0.5  # hydraulic: share of r_grapple for closed jaws without a log; a grip earns all
 NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
@@ -173,9 +173,8 @@ def reward_terms(
     command (N, 6) the commanded velocities in rad/s and m/s, ground (N,) the decision's largest
     force of crane on ground in N.
 
-    kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, most once
-    both jaws hold it, r_lift if the log is lifted there, and r_balance while both jaws hold it
-    (docs/environment.md says why).
+    kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
+    the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
     r_ground punishes hitting the ground. An easy task forgives it: a crane that does not lift yet
     would learn to stay away.
     """
@@ -190,8 +189,9 @@ def reward_terms(
     else:
         near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
         held = state.touching.all(axis=-1)
-        grip = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
-        r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * grip
+        if actuators == "hydraulic":
+            closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
+        r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
         height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze

@@ -293,9 +293,9 @@ if __name__ == "__main__":
     run = crane_runs.Run(ALGORITHM, args, envs, agent, optimizer, checkpoint)
 
     def set_difficulty(iteration: int) -> None:
-        """Easy starts first: the difficulty stays at 0 in the first quarter of the warm-up."""
+        """Easy starts first: the difficulty rises to its full value in the warm-up."""
         progress = iteration / run.num_iterations
-        share = max(0, 4 * progress / args.warm_up - 1) / 3 if progress < args.warm_up else 1.0
+        share = progress / args.warm_up if progress < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 

@@ -165,10 +165,8 @@ class PlainCrane(gymnasium.Env):
         reward = exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
         hardness = min(max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0), 1.0)
         reward -= crane_task.GROUND_WEIGHT["ideal"] * hardness
-        holds = touch[0] > 0 and touch[1] > 0
-        grip = 1.0 if holds else min(q[7] / crane_task.Q8_MAX, crane_task.EMPTY_GRIP)
-        reward += crane_task.GRAPPLE_WEIGHT * grasp * grip
-        if holds:
+        reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
+        if touch[0] > 0 and touch[1] > 0:
             calm = 1 - tanh(hypot(*command[:5]))
             reward += crane_task.BALANCE_WEIGHT * calm * lift
             on_ground = hypot(*touch[2:5]) + hypot(*touch[5:8])

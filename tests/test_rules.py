@@ -114,7 +114,7 @@ def terms_of(crane, d_combine, command, ground=None, **kwargs):
 def test_staged_reward():
     lifted = {"log_centre": [4.0, 6.0, 0.45], "grapple_centre": [4.3, 6.125, 0.8]}
     terms = terms_of(state(**lifted), 0.4, COMMAND)
-    r, grasp = np.exp(-0.4), 2 * np.exp(-0.15)  # 0.05 m farther than 0.35 m
+    r, grasp = np.exp(-0.4), 2 * 0.5 * np.exp(-0.15)  # q8 / 3 = 0.5; 0.05 m farther than 0.35 m
     # 0.125 m off the centre, half of 0.25 m and a quarter of 0.5 m; clearance 0.45 - 0.2 = 0.5^2
     centred, calm = np.exp(-0.25), 1 - np.tanh(0.5)
     lift = 0.5 * centred
@@ -131,15 +131,24 @@ def test_staged_reward():
     np.testing.assert_allclose(terms, [r, grasp * np.exp(-4), 0.0, 0.0], atol=1e-6)
     one_jaw = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[True, False])
     terms = terms_of(one_jaw, 0.4, COMMAND)
-    np.testing.assert_allclose(terms, [r, grasp / 2, 2 * 0.5, 0.0])  # q8 / 3 = 0.5
-    for q8, share in [(0.6, 0.2), (2.4, 0.5)]:  # closed without a log
-        one_jaw.q[0, 7] = q8
-        assert terms_of(one_jaw, 0.4, COMMAND)[1] == pytest.approx(grasp * share)
+    np.testing.assert_allclose(terms, [r, grasp, 2 * 0.5, 0.0])
     for clearance, expected in [(1.0, 2.0), (2.25, 2 / 1.5), (4.0, 1.0)]:  # 1 m is best
         high = state(log_centre=[4, 6, 0.2 + clearance], grapple_centre=[4.0, 6.0, 3.2])
         terms = terms_of(high, 0.34, COMMAND)
         np.testing.assert_allclose(terms[2], expected)
-    np.testing.assert_allclose(terms[1], 2.0)  # nearer than 0.35 m is no better for r_grapple
+    np.testing.assert_allclose(terms[1], 1.0)  # nearer than 0.35 m is no better for r_grapple
+
+
+@pytest.mark.parametrize(
+    "actuators, touching, q8, share",
+    [("ideal", True, 1.8, 0.6), ("ideal", False, 2.4, 0.8), ("hydraulic", True, 1.8, 1.0)]
+    + [("hydraulic", False, 0.6, 0.2), ("hydraulic", False, 2.4, 0.5)],
+)
+def test_with_drives_closed_jaws_pay_less_than_a_grip(actuators, touching, q8, share):
+    crane = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1], touching=[touching, True])
+    crane.q[0, 7] = q8
+    terms = terms_of(crane, 0.3, COMMAND, actuators=actuators)
+    assert terms[1] == pytest.approx(2 * share)
 
 
 def test_carrying_the_log_pays_before_it_rises():
@@ -167,7 +176,8 @@ def test_hitting_the_ground_costs():
             assert terms[4] == pytest.approx(expected)
             easy = terms_of(here, 0.4, COMMAND, **given, difficulty=0.5)
             assert easy[4] == pytest.approx(expected / 4)
-            np.testing.assert_array_equal(terms[:4], terms_of(here, 0.4, COMMAND))
+            without = terms_of(here, 0.4, COMMAND, actuators=actuators)
+            np.testing.assert_array_equal(terms[:4], without)
         assert terms_of(here, 0.4, COMMAND, ground=force, kind="paper")[4] == 0
 
 

@@ -455,7 +455,7 @@ def test_the_difficulty_rises_in_the_warm_up(tmp_path, run_here, monkeypatch, al
     run_here(algorithm, *arguments)
     folder = only_run(tmp_path)
     difficulties = scalars(folder)["schedule/difficulty"]
-    expected = [0, 0.8 / 3, 1.6 / 3, 0.8, 0.8, 0.8, 0.8, 0.8]
+    expected = [0.2, 0.4, 0.6, 0.8, 0.8, 0.8, 0.8, 0.8]
     np.testing.assert_allclose(difficulties, expected, rtol=1e-6)
     path = folder / "checkpoint.pt"
     torch.save(torch.load(path, weights_only=True) | {"iteration": 2}, path)
