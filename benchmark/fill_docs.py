@@ -130,9 +130,9 @@ def matrix() -> str:
 
 def costs() -> str:
     """What the trials of each policy cost on its own level."""
-    heads = [head for head, *_ in eval_crane.CARE_COLUMNS]
-    lines = []
-    for row in rows_of("levels.csv"):
+    rows, lines = rows_of("levels.csv"), []
+    heads = [head for head, *_ in eval_crane.CARE_COLUMNS if head in rows[0]]
+    for row in rows:
         if row["trained_on"] == row["judged_on"] and row["seed"] == "1":
             lines.append(
                 [row["trained_on"], row["method"], *[f"{float(row[head]):.2f}" for head in heads]]

@@ -33,8 +33,8 @@ HERE = Path(__file__).parent
 WRITING = threading.Lock()  # of evaluations.csv
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
 LEVELS = {  # flags by name
-    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 2048000 --warm-up 0.6",
-    "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000 --warm-up 0.3",
+    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 2048000",
+    "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000 --warm-up 0.2",
 }
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
