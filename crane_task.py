@@ -41,7 +41,8 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 60.0}  # what r_ground takes away at GENTLE_FORCE
+# What r_ground takes away at GENTLE_FORCE, from nothing at half of it.
+GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 60.0}
 GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}  # times that at most: stiff servos only hit hard
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
