@@ -5,7 +5,7 @@
     envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=64)  # many at once, `CraneVectorEnv`
 
 The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
-stages), and its grapple hangs from two passive joints q5, q6 below a rotator q7 and two jaws q8.
+stages). Two passive joints q5, q6 let a rotator q7 hang down with the grapple's two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
 Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there,
 `ForestryCraneHydraulic-v0` the same crane with the drives that were measured on the machine, and in
@@ -124,8 +124,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     CARE says what the episode has cost so far: `ground_peak` (N), `ground_impulse` (N s) and
     `ground_time` (s above GENTLE_FORCE) of the crane's force on the ground, `litres` of oil,
     `energy` of the pump and `work` of the drives (J), `swing_peak` (rad) of the grapple, `time_up`
-    (s until the log is safely up, inf before), `log_speed` (m/s), and `gentle`: success without
-    more than GENTLE_FORCE on the ground. With randomize, `drawn_...` say what was drawn (DRAWN).
+    (s until the log was safely up, inf unless it still is), `log_speed` (m/s), and `gentle`: success
+    without more than GENTLE_FORCE on the ground. With randomize, `drawn_...` say what was drawn.
     """
 
     metadata = {
@@ -283,7 +283,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return obs, reward, terminated, truncated, info
 
     def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """`step` without autoreset: an ended episode stays where it ended."""
+        """`step` without autoreset. RuntimeError before `reset`, ValueError for wrong actions."""
         if self.rngs is None:
             raise RuntimeError("call reset() before step()")
         actions = np.asarray(actions, dtype=np.float64)

@@ -39,7 +39,7 @@ Exponent = Annotated[float, Range(-20, 20)]
 
 
 def check(values: Mapping[str, Any], *annotated: Any) -> None:
-    """ValueError says which of the values its annotation does not allow, and what it allows.
+    """ValueError names a value that its annotation does not allow, and what it allows.
 
     annotated: classes or functions. Checked are bools, Literals and numbers with a Range, also in
     a tuple or beside None.

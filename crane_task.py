@@ -33,7 +33,7 @@ GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.
 OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
 DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give it
 GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed the jaws
-LIFT_WEIGHT = 2.0  # largest staged r_lift
+LIFT_WEIGHT = 2.0  # largest part of staged r_lift that height earns; CARRY_WEIGHT adds to it
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
 CLOSING_HEIGHT = 0.1  # m above Delta_p = 0: closing jaws pull the grapple down, onto the ground
 EMPTY_GRIP = 0.5  # hydraulic: share of r_grapple for closed jaws without a log; a grip earns all
@@ -41,9 +41,10 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-# What r_ground takes away at GENTLE_FORCE, from nothing at half of it.
+# What r_ground takes away at GENTLE_FORCE. It begins at half of it and grows linearly.
 GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 60.0}
-GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}  # times that at most: stiff servos only hit hard
+# r_ground is at most this many times GROUND_WEIGHT. Stiff servos hit hard or not at all.
+GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping
 TERMS = ["r_distance", "r_grapple", "r_lift", "r_balance", "r_ground"]
@@ -169,10 +170,10 @@ def reward_terms(
 ) -> Array:
     """The TERMS of the reward, which is their sum, (5, N).
 
-    distance (N,) in m is d_combine = ||Delta_p|| + 1 m Delta_psi, for "staged" with a Delta_p that
-    is 0 CLOSING_HEIGHT higher. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
-    command (N, 6) the commanded velocities in rad/s and m/s, ground (N,) the decision's largest
-    force of crane on ground in N.
+    distance (N,) in m is ||Delta_p|| + 1 m Delta_psi. "staged" takes Delta_p + (0, 0,
+    CLOSING_HEIGHT), which is 0 where the grapple is CLOSING_HEIGHT higher. clearance and miss (N,)
+    in m are `log_clearance` and `centre_miss`, command (N, 6) the commanded velocities in rad/s and
+    m/s, ground (N,) the decision's largest force of crane on ground in N.
 
     kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
     the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).

@@ -1,6 +1,6 @@
 """Cranes to train a policy and to judge it on, and the trials that judge it.
 
-The training scripts and eval_crane.py use it. The protocol of the trials is docs/results.md's:
+The training scripts and eval_crane.py use it. docs/compare.md has the protocol of the trials:
 log diameters 0.3 ... 0.8 m, seeds that belong to the trial alone, success as `CraneVectorEnv` says.
 """
 

@@ -79,7 +79,7 @@ class Args:
     signed_yaw: bool = True
     """what --policy scripted observes: the signed angle to the log or the paper's Delta_psi"""
     pose_noise: Literal["none", "step", "episode"] | None = None
-    """error of the observed log pose; unset: the table without and the one with `step`"""
+    """error of the observed log pose; unset: one table without and one with `step`"""
     trials: Annotated[int, Range(1, 10_000)] = 100
     """trials per log diameter"""
     diameters: tuple[Annotated[float, Range(D_MIN, D_MAX)], ...] = DIAMETERS
@@ -93,7 +93,7 @@ class Args:
     csv: Path | None = None
     """write one row a trial to this file"""
     json: bool = False
-    """print one JSON object and nothing else (one table, noise none unless said)"""
+    """print one JSON object and nothing else: one table, without pose errors unless asked for"""
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     camera: Literal["overview", "side", "grapple"] = "overview"
@@ -373,6 +373,15 @@ def print_table(records: list[dict], cells: list[dict], paper: dict, title: str)
     print_care(records, cells)
 
 
+def mean_costs(trials: list[dict]) -> dict[str, float]:
+    """CARE_COLUMNS over trials by heading; time_up over the successes, NaN without any."""
+    costs = {}
+    for head, key, factor, mean in CARE_COLUMNS:
+        values = [r[key] for r in trials if key != "time_up" or r["success"]]
+        costs[head] = factor * mean(values).item() if values else np.nan
+    return costs
+
+
 def print_care(records: list[dict], cells: list[dict]) -> None:
     """What the trials cost, one row a diameter and one for all."""
     heads = [head for head, *_ in CARE_COLUMNS]
@@ -381,9 +390,8 @@ def print_care(records: list[dict], cells: list[dict]) -> None:
     rows = [([r for r in records if r["diameter"] == c["diameter"]], c["diameter"]) for c in cells]
     for trials, name in [*rows, (records, "all")]:
         line = [f"{name:<5}", f"{100 * np.mean([r['gentle'] for r in trials]):<8.1f}"]
-        for head, key, factor, mean in CARE_COLUMNS:
-            values = [r[key] for r in trials if key != "time_up" or r["success"]]
-            number = f"{factor * mean(values):.2f}" if values else ""
+        for head, cost in mean_costs(trials).items():
+            number = "" if np.isnan(cost) else f"{cost:.2f}"
             line.append(f"{number:<{len(head)}}")
         print(f"| {' | '.join(line)} |")
     print("Gentle is success without more than 20 kN of the crane on the ground. Peak and impulse")
@@ -482,6 +490,8 @@ def main() -> None:
             answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
             answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
             answer["mean_gentle_rate"] = sum(r["gentle"] for r in records) / len(records)
+            costs = mean_costs(records)  # JSON has no NaN
+            answer["costs"] = {name: None if np.isnan(x) else x for name, x in costs.items()}
             print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"

@@ -96,7 +96,10 @@ def shipped() -> str:
 
 
 def seeds() -> str:
-    """evaluations.csv: success and gentle success of each training seed, level by level."""
+    """evaluations.csv: success, gentle success and costs of each training seed, level by level.
+
+    A run whose costs are not in the file has empty cells.
+    """
     lines = []
     for level in LEVELS:
         for script, method in plot_curves.LABELS.items():
@@ -108,9 +111,12 @@ def seeds() -> str:
             for name in ("success", "gentle"):
                 numbers = [float(row[name]) for row in mine]
                 line += [joined(numbers, 1), f"{np.mean(numbers):.1f}"]
+            for name in ("energy [kJ]", "up [s]"):
+                line.append(joined([float(row[name]) for row in mine if row[name]], 1))
             lines.append(line)
     header = ["level", "method", "decisions [million]", "seeds"]
-    return table([*header, "success", "mean", "gentle", "mean"], lines)
+    header += ["success", "mean", "gentle", "mean", "energy [kJ]", "up [s]"]
+    return table(header, lines)
 
 
 def matrix() -> str:

@@ -89,13 +89,10 @@ def judge(
     envs = crane_trials.make_envs(LEVELS[level], len(seeds), **options)
     results = crane_trials.run_trials(policy, envs, seeds)
     envs.close()
-    won = results["success"]
-    row = {"trials": len(seeds), "success": 100 * won.mean()}
+    row = {"trials": len(seeds), "success": 100 * results["success"].mean()}
     row["gentle"] = 100 * results["gentle"].mean()
-    for head, key, factor, mean in eval_crane.CARE_COLUMNS:
-        values = results[key][won] if key == "time_up" else results[key]
-        row[head] = factor * mean(values) if values.size else np.nan
-    return row
+    trials = [dict(zip(results, values)) for values in zip(*results.values())]
+    return row | eval_crane.mean_costs(trials)
 
 
 @contextmanager

@@ -92,7 +92,7 @@ def evaluate(name: str, seed: int, run: Path) -> None:
     """Judge a finished run in 600 trials of seed 40000: its rows of evaluations.csv, in %.
 
     One row with the exact pose and one with pose errors: a column a diameter, then the means of
-    success and of gentle success.
+    success and of gentle success, and what the trials cost, as eval_crane.py prints it.
     """
     path, rows, new = HERE / "evaluations.csv", {}, {}
     for noise in ("none", "step"):
@@ -104,6 +104,7 @@ def evaluate(name: str, seed: int, run: Path) -> None:
             row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
         for score in ("success", "gentle"):
             row[score] = round(100 * result[f"mean_{score}_rate"], 2)
+        row |= {name: cost and float(f"{cost:.4g}") for name, cost in result["costs"].items()}
         new[name, str(seed), noise] = row
     with WRITING:
         if path.exists():

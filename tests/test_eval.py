@@ -97,6 +97,8 @@ def test_json_and_csv(tmp_path):
         assert cell["failures"] == {"not_reached": 2}
         assert cell["interval"][0] == 0 and 0.6 < cell["interval"][1] < 0.7
     assert answer["mean_success_rate"] == 0
+    # no log is ever up, and a crane that never moves swings by the 0.05 rad of its starts
+    assert answer["costs"]["up [s]"] is None and 0 < answer["costs"]["swing [rad]"] < 0.2
     rows = list(csv.DictReader(file.open()))
     assert [row["diameter"] for row in rows] == ["0.4", "0.4", "0.8", "0.8"]
     assert {row["failure"] for row in rows} == {"not_reached"}
