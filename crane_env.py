@@ -124,7 +124,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     CARE says what the episode has cost so far: `ground_peak` (N), `ground_impulse` (N s) and
     `ground_time` (s above GENTLE_FORCE) of the crane's force on the ground, `litres` of oil,
     `energy` of the pump and `work` of the drives (J), `swing_peak` (rad) of the grapple, `time_up`
-    (s until the log was safely up, inf unless it still is), `log_speed` (m/s), and `gentle`: success
+    (s until the log is safely up, inf unless it still is), `log_speed` (m/s), and `gentle`, success
     without more than GENTLE_FORCE on the ground. With randomize, `drawn_...` say what was drawn.
     """
 
