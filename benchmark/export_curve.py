@@ -21,8 +21,10 @@ COLUMNS = {
     "losses/approx_kl": "approx_kl",
     "trpo/kl": "approx_kl",
     "eval/success_rate": "eval_success_rate",
+    "eval/gentle_rate": "eval_gentle_rate",
     "eval/episodic_return": "eval_episodic_return",
     "final/success_rate": "final_success_rate",
+    "final/gentle_rate": "final_gentle_rate",
 }
 
 

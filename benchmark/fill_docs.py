@@ -112,7 +112,7 @@ def seeds() -> str:
                 numbers = [float(row[name]) for row in mine]
                 line += [joined(numbers, 1), f"{np.mean(numbers):.1f}"]
             for name in ("energy [kJ]", "up [s]"):
-                line.append(joined([float(row[name]) for row in mine if row[name]], 1))
+                line.append(joined([float(row[name]) for row in mine if row.get(name)], 1))
             lines.append(line)
     header = ["level", "method", "decisions [million]", "seeds"]
     header += ["success", "mean", "gentle", "mean", "energy [kJ]", "up [s]"]
@@ -248,6 +248,41 @@ def ablations() -> str:
     return table(header, lines)
 
 
+def speed() -> str:
+    """throughput.csv: the ratios, a column a frame skip."""
+    ratios: dict[str, dict[str, str]] = {}
+    for row in measured_ratios():
+        ratios.setdefault(row["what"], {})[row["skip"]] = f"{float(row['median']):.2f}"
+    rows = [
+        [name, *[found.get(skip, "") for skip in ("20", "1")]] for name, found in ratios.items()
+    ]
+    return table(["ratio", "skip 20", "skip 1"], rows)
+
+
+def missed() -> str:
+    """throughput.csv: the ratios below their targets."""
+    rows = []
+    for row in measured_ratios():
+        if row["note"] and float(row["median"]) < float(row["note"]):
+            rows.append([row["what"], row["skip"], f"{float(row['median']):.2f}", row["note"]])
+    return table(["ratio", "skip", "value", "target"], rows)
+
+
+def measured_ratios() -> list[dict[str, str]]:
+    with (HERE / "throughput.csv").open() as file:
+        next(file)  # the machine
+        return [row for row in csv.DictReader(file) if row["part"] == "ratio"]
+
+
+def scaling() -> str:
+    """scaling.csv: what the model predicts for a network between machines."""
+    rows = [row for row in rows_of("scaling.csv") if row["what"] == "model, 10 Gbit/s"]
+    header = ["ranks, one core each", "cranes on each", "decisions per second"]
+    return table(
+        header, [[r["ranks"], r["cranes"], f"{round(float(r['SPS']), -2):,.0f}"] for r in rows]
+    )
+
+
 TABLES = {
     "leaderboard": leaderboard,
     "results": results,
@@ -260,6 +295,9 @@ TABLES = {
     "paper": paper,
     "learning": learning,
     "ablations": ablations,
+    "speed": speed,
+    "missed": missed,
+    "scaling": scaling,
 }
 
 

@@ -145,7 +145,7 @@ def append(path: Path, jobs: list[dict], measure: Callable) -> None:
             continue
         rows.append(job | {name: f"{value:.4g}" for name, value in results.items()})
         with crane_view.whole_file(path) as part, open(part, "w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0].keys())
+            writer = csv.DictWriter(file, rows[-1].keys())
             writer.writeheader()
             writer.writerows(rows)
 

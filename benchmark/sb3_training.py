@@ -75,7 +75,6 @@ class CollectOnly(stable_baselines3.PPO):
 
 def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) -> list[Iteration]:
     """Four iterations of SB3 on n cranes."""
-    rollout = min(rollout, 2048) if algorithm == "defaults" else rollout  # theirs
     makers = [partial(PlainCrane, frame_skip)] * n
     if kind == "Subproc":
         envs = SubprocVecEnv(makers, start_method=START)
@@ -89,8 +88,6 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
     maker, network = stable_baselines3.PPO, "MlpPolicy"
     if algorithm == "collect":
         maker = CollectOnly
-    elif algorithm == "defaults":
-        options = {"n_steps": rollout, "device": "cpu", "seed": SEED}
     elif algorithm == "TRPO":  # the step as in trpo_crane.py, the critic as above
         maker = sb3_contrib.TRPO
         options |= {"n_critic_updates": options.pop("n_epochs")}
