@@ -12,10 +12,14 @@ import nbformat
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 DOCS = Path(__file__).parent.parent / "docs"
-FIRST = """import os
+FIRST = """import importlib.util
+import os
+import sys
 
 if os.path.basename(os.getcwd()) == "docs":
-    os.chdir("..")  # the repository's root"""
+    os.chdir("..")  # the repository's root
+if importlib.util.find_spec("mujoco") is None:  # on a fresh machine, such as Colab's
+    !{sys.executable} -m pip install -q -r requirements.txt"""
 
 
 def notebook(text: str) -> nbformat.NotebookNode:

@@ -9,6 +9,7 @@ Each takes some minutes without a GPU: MuJoCo then draws on the processor.
 
 import sys
 from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,18 +97,19 @@ def stills(policy: Any, task: dict) -> None:
 
 
 def failures(policy: Any, task: dict) -> None:
-    """Up to six failed trials of the 600, as they ended."""
+    """Up to six failed trials of the 600, as they ended: of each diameter and failure one first."""
     args = eval_crane.Args(seed=SEED)
     records = eval_crane.judge(policy, *eval_crane.task_of(args, task), args)
-    shots = []
+    kinds: dict[tuple, list[int]] = {}
     for index, record in enumerate(records):
-        if record["failure"] and len(shots) < 6:
-            diameter = record["diameter"]
-            *_, (time, picture, _) = frames_of(
-                policy, task, diameter, index % args.trials, (400, 300)
-            )
-            what = f"{diameter} m, {record['failure'].replace('_', ' ')}, {time:.1f} s"
-            shots.append(labelled(picture, what))
+        if record["failure"]:
+            kinds.setdefault((record["diameter"], record["failure"]), []).append(index)
+    by_turns = [index for turn in zip_longest(*kinds.values()) for index in turn]
+    shots = []
+    for index in sorted([index for index in by_turns if index is not None][:6]):
+        diameter, failure = records[index]["diameter"], records[index]["failure"]
+        *_, (time, picture, _) = frames_of(policy, task, diameter, index % args.trials, (400, 300))
+        shots.append(labelled(picture, f"{diameter} m, {failure.replace('_', ' ')}, {time:.1f} s"))
     if not shots:
         raise SystemExit("none of the trials failed")
     sheet(shots, 3, FIGURES / "failures.jpg")

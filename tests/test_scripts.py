@@ -249,7 +249,7 @@ def test_an_update_stops_after_the_first_epoch_beyond_target_kl(tmp_path, run_he
 
 KEYS = """
 time/SPS time/simulation_SPS schedule/learning_rate schedule/gamma time/updates schedule/difficulty
-charts/episodic_return charts/episodic_length charts/success_rate
+charts/episodic_return charts/episodic_length charts/success_rate charts/gentle_rate
 losses/value_loss losses/policy_loss losses/entropy losses/explained_variance losses/grad_norm
 reward/distance reward/grapple reward/lift reward/balance reward/ground
 termination/diverged termination/joint_limit termination/overspeed termination/log_too_far

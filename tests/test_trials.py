@@ -121,11 +121,14 @@ def test_rollout_report_of_cranes():
     infos[1]["episode"] = {"r": np.array([99.0, 5, 40]), "l": np.array([99, 10, 90])}
     infos[2]["episode"] = {"r": np.array([30.0, 99, 99]), "l": np.array([90, 99, 99])}
     infos[3]["episode"] = {"r": np.array([1.0, 99, 99]), "l": np.array([60, 99, 99])}
+    infos[1]["gentle"], infos[2]["gentle"] = np.array([True, False, True]), np.array([False] * 3)
+    infos[3]["gentle"] = np.array([False, True, True])
     report = rollout_report(envs, infos)
     expected = {
         "charts/episodic_return": (5 + 40 + 30 + 1) / 4,
         "charts/episodic_length": (10 + 90 + 90 + 60) / 4,
         "charts/success_rate": 0.75,
+        "charts/gentle_rate": 0.25,
         "schedule/difficulty": 0.35,
         "reward/distance": 0.0,
         "reward/grapple": (2 + 0 + 0 + 0) / 4,
