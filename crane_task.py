@@ -19,6 +19,10 @@ POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
 POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
+JAW_LENGTH, PIVOT_HEIGHT = (
+    0.8566,
+    0.5,
+)  # m, from a jaw's pivot to its tip; from p_C up to the pivots
 
 TIME_LIMIT = 9.0  # s, of an episode
 REACH_TIME = 6.0  # s, by which the log must have been reached
@@ -157,6 +161,15 @@ def centre_miss(state: CraneState) -> Array:
     return np.abs(np.sum((state.grapple_centre - state.log_centre) * state.log_axis, axis=-1))
 
 
+def grip_depth(state: CraneState) -> Array:
+    """How far the tips of hanging jaws are below the log's centre, in radii of the log, (N,).
+
+    Jaws that pinch a log above its centre squeeze it out.
+    """
+    tips = state.grapple_centre[:, 2] + PIVOT_HEIGHT - JAW_LENGTH * np.sin(state.q[:, 7])
+    return (state.log_centre[:, 2] - tips) / (state.diameter / 2)
+
+
 def reward_terms(
     state: CraneState,
     distance: Array,
@@ -191,14 +204,15 @@ def reward_terms(
     else:
         near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
         held = state.touching.all(axis=-1)
+        grip = np.exp(-((miss / LIFT_MISS) ** 2))
         if actuators == "hydraulic":
             closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
+            grip *= np.clip(0.5 + grip_depth(state), 0, 1)
         r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
         height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
-        centred = np.exp(-((miss / LIFT_MISS) ** 2))
-        lift, r_carry = centred * height, CARRY_WEIGHT * centred * held * state.carried
+        lift, r_carry = grip * height, CARRY_WEIGHT * grip * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
         hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, GROUND_MOST[actuators])
         r_ground = -GROUND_WEIGHT[actuators] * difficulty**2 * hardness

@@ -135,6 +135,13 @@ MUTATIONS = [
         "test_rules -k closed",
     ),
     Mutation(
+        "a log pinched above its centre pays as a firm grip",
+        ("crane_task.py",),
+        "np.clip(0.5 + grip_depth(state), 0, 1)",
+        "1.0",
+        "test_rules -k centre",
+    ),
+    Mutation(
         "an easy task punishes as the full one",
         ("crane_task.py",),
         "* difficulty**2 *",
@@ -256,8 +263,8 @@ MUTATIONS = [
     Mutation(
         "one jaw is enough to carry",
         ("crane_task.py",),
-        "CARRY_WEIGHT * centred * held * state.carried",
-        "CARRY_WEIGHT * centred * state.carried",
+        "CARRY_WEIGHT * grip * held * state.carried",
+        "CARRY_WEIGHT * grip * state.carried",
         "test_rules -k carrying",
     ),
     Mutation(

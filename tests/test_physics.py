@@ -134,6 +134,9 @@ def test_jaw_geometry():
     np.testing.assert_allclose(tips(np.pi / 2)[:, 2], 0.8566, atol=1e-9)
     assert abs(np.diff(tips(np.pi / 2)[:, 1])[0] - 0.665) < 1e-3
     assert abs(np.diff(tips(1.97)[:, 1])[0]) < 0.01
+    assert model.site("grapple_centre").pos[2] == crane_task.PIVOT_HEIGHT
+    for q8 in (0.4, 1.5, 2.5):
+        np.testing.assert_allclose(tips(q8)[:, 2], crane_task.JAW_LENGTH * np.sin(q8), atol=1e-9)
 
 
 def test_moving_mass():

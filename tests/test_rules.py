@@ -151,6 +151,31 @@ def test_with_drives_closed_jaws_pay_less_than_a_grip(actuators, touching, q8, s
     assert terms[1] == pytest.approx(2 * share)
 
 
+def test_grip_depth():
+    """A log of 0.2 m radius, jaws straight down: tips 0.8566 - 0.5 = 0.3566 m below p_C."""
+    for height, depth in [(0.5566, 0.0), (0.4566, 0.5), (0.3566, 1.0), (0.6566, -0.5)]:
+        crane = state(log_centre=[4.0, 6.0, 0.2], grapple_centre=[4.0, 6.0, height])
+        crane.q[0, 7] = np.pi / 2
+        np.testing.assert_allclose(crane_task.grip_depth(crane), [depth], atol=1e-12)
+    crane.q[0, 7] = np.pi - 0.5  # turned in, the tips are higher than at pi/2
+    tips = 0.6566 + 0.5 - 0.8566 * np.sin(0.5)
+    np.testing.assert_allclose(crane_task.grip_depth(crane), [(0.2 - tips) / 0.2])
+
+
+@pytest.mark.parametrize(
+    "actuators, height, share",
+    [("hydraulic", 0.5566, 0.5), ("hydraulic", 0.3566, 1.0), ("hydraulic", 0.7566, 0.0)]
+    + [("ideal", 0.7566, 1.0)],
+)
+def test_with_drives_a_lift_pays_for_tips_below_the_logs_centre(actuators, height, share):
+    """On the tips all of the lift is lost 0.5 radii above the centre, none 0.5 radii below."""
+    lifted = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4.0, 6.0, 0.25 + height])
+    lifted.q[0, 7] = np.pi / 2
+    still = np.zeros((1, 6))
+    terms = terms_of(lifted._replace(carried=np.ones(1)), 0.3, still, actuators=actuators)
+    np.testing.assert_allclose(terms[2:], [share * (2 * 0.5 + 1), share * 3 * 0.5], atol=1e-9)
+
+
 def test_carrying_the_log_pays_before_it_rises():
     """With both jaws, near the centre: leads to the first lift of a heavy log."""
     down = state(log_centre=[4.0, 6.0, 0.2], grapple_centre=[4.0, 6.0, 0.4], touching=[True, True])
