@@ -72,6 +72,7 @@ class Args:
     vf_coef: Factor = 0.5  # c_v, weight of the value loss
     max_grad_norm: Factor = 0.5  # bound of the gradient's norm
     perturbation: Share = 0.1  # eps at the start, half width of the perturbation of a_n
+    perturbed: Annotated[float, Range(0.01, 1)] = 0.4  # share of the run in which eps falls to 0
     log_excess_init: Exponent = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
     narrowing: Exponent = 2.5  # total rise of log(alpha - 1) and log(beta - 1) along the run
 
@@ -251,9 +252,10 @@ if __name__ == "__main__":
     next_obs = to_tensor(envs.reset(seed=seeds)[0])
     for iteration in run.iterations():
         # Schedules
-        left = 1.0 - (iteration - 1.0) / run.num_iterations
+        progress = (iteration - 1.0) / run.num_iterations
+        left = 1.0 - progress
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
-        epsilon = args.perturbation * max(0.0, 2 * left - 1)
+        epsilon = args.perturbation * max(0.0, 1 - progress / args.perturbed)
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
         reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows

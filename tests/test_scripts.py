@@ -683,7 +683,7 @@ def test_schedules_along_the_run(tmp_path, run_here, algorithm):
     if algorithm == "mppo_beta":
         width, expected = saved["weights"]["actor.4.bias"], saved["args"]["log_excess_init"] + 0.6
         assert (np.diff(values["policy/alpha"]) > 0.1).all()
-        assert values["schedule/perturbation"] == pytest.approx([0.1, 0.05, 0, 0])
+        assert values["schedule/perturbation"] == pytest.approx([0.1, 0.0375, 0, 0])
     else:
         width, expected = saved["weights"]["log_std"], saved["args"]["log_std_init"] - 0.6
         assert values["policy/std"] == pytest.approx(np.exp([-1.2, -1.35, -1.5, -1.65]), rel=1e-3)
