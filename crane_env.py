@@ -197,9 +197,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.sensordata, self.log_size = batch.bind("sensordata"), batch.geom("log").size
         self.log_velocity = batch.joint("log").qvel  # m/s and rad/s
         self.drive_force = batch.bind("qfrc_actuator")
-        # the last sensor remembers its five last values, x, y, z each, after seven other numbers
-        begin = self.model.sensor_historyadr[-1] + 7
-        self.ground_force = batch.bind("history")[:, begin : begin + 15]
+        # the last numbers there are what the last sensor measured in the last steps: x, y, z each
+        remembered = 3 * self.model.sensor_history[-1, 0]
+        self.ground_force = batch.bind("history")[:, -remembered:]
         self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
         velocity, integrators = np.split(self.model.actuator_gainprm, 2)
         self.servo_kv = velocity[:, 0]  # 0 of hydraulic drives
@@ -277,7 +277,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             starts, start_info = self.start_episodes(np.flatnonzero(again))
             obs[again] = starts[again]
             if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-                reward[again], info["time_to_reach"][again] = 0.0, np.inf
+                reward[again], info["log_speed"][again] = 0.0, 0.0
+                info["time_to_reach"][again] = info["time_up"][again] = np.inf
                 for key, values in (start_info | self.costs.total).items():
                     info[key][again] = values[again]
         return obs, reward, terminated, truncated, info
@@ -355,8 +356,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 wanted, seconds = (gain * command)[ids], nstep * every * TIMESTEP
                 speed = self.valves.mean_speed(ids, wanted, self.qpos[ids], seconds)
                 self.ctrl[ids, 8:] = speed[:, COMMAND_OF_SERVO]
-            # sensors are needed after the last physics step only
-            last = start + nstep == self.frame_skip
+            last = start + nstep == self.frame_skip  # sensors are needed after this one only
             stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
             try:
                 self.batch.step(nstep=nstep, stage=stage)
@@ -370,7 +370,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def count_costs(self, seconds: float) -> None:
         """Add to `costs` what the last piece of a decision took."""
-        ground = np.linalg.norm(self.ground_force.reshape(-1, 5, 3), axis=-1)
+        ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1)
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
         force = self.drive_force[:, SERVOS] @ np.eye(6)[COMMAND_OF_SERVO]  # of both stages, jaws
         self.costs.add(ground, q, dq, force, seconds)

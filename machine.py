@@ -77,6 +77,7 @@ DRAWN = {
     "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
 }
 OF_DRIVES = {"stiffness", "damping", "extra_delay", "gain"}  # of DRAWN; the ideal crane has none
+MOVING = 0.01  # share of its speed limit above which a joint takes oil, and not only trembles
 COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 
 
@@ -117,6 +118,7 @@ def load_model(
 
 def install_drives(spec: mujoco.MjSpec) -> None:
     """Turn the servos of assets/crane.xml into drives."""
+    spec.sensor("ground_force").nsample = VALVE_STEPS  # crane_env counts costs after so many steps
     for index, command in zip(SERVOS, COMMAND_OF_SERVO):
         joint = spec.joints[index]
         joint.damping[0] = DAMPING[command]
@@ -217,14 +219,15 @@ class Costs:
     def add(self, ground: Array, q: Array, dq: Array, force: Array, seconds: float) -> None:
         """Add the costs of the last seconds.
 
-        ground (N, 5) in N at each of the last physics steps. All else is of the last one: q (N, 8),
-        dq (N, 6) and force (N, 6) of the drives, in rad, m, s, N m and N. The pump gives every
-        joint its oil, at the pressure that the hardest of them needs. Force limits are the same in
-        both directions, so a joint that pushes with its rod side may need more than 25 MPa.
+        ground (N, k) in N at each of the last k physics steps. All else is of the last one:
+        q (N, 8), dq (N, 6) and force (N, 6) of the drives, in rad, m, s, N m and N. The pump gives
+        every joint its oil, at the pressure that the hardest of those that move needs. At their
+        force limits boom, telescope and jaws need more than the pump's 25 MPa.
         """
         oil = oil_per_movement(q, dq)
         flow = np.sum(oil * np.abs(dq), axis=-1)
-        pressure = np.maximum(force * np.sign(dq) / oil, 0).max(axis=-1)
+        moving = np.abs(dq) > MOVING * np.minimum(*np.abs(SPEEDS["real"]))
+        pressure = np.max(np.maximum(force * np.sign(dq) / oil, 0) * moving, axis=-1)
         swing = np.hypot(q[:, 4] - np.pi / 2 + q[:, 1] + q[:, 2], q[:, 5] - np.pi / 2)
         self.impact = np.maximum(self.impact, ground.max(axis=-1))
         total = self.total

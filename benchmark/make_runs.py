@@ -33,9 +33,10 @@ HERE = Path(__file__).parent
 WRITING = threading.Lock()  # of evaluations.csv
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
 LEVELS = {  # flags by name
-    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 2048000",
+    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 1536000",
     "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000 --warm-up 0.2",
 }
+OWN = {("mppo_beta_crane", "randomized"): "--perturbed 0.2"}  # flags that the other scripts lack
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
 # Script and flags by name. At another decision rate the number of simulation steps, updates and
@@ -119,23 +120,28 @@ def evaluate(name: str, seed: int, run: Path) -> None:
         part.replace(path)
 
 
+def flags_of(script: str, level: str) -> list[str]:
+    """The flags of a training on one of LEVELS."""
+    return f"{LEVELS[level]} {OWN.get((script, level), '')}".split()
+
+
 def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) -> None:
     often = ["--eval-every", "25"]
     if what == "curves":
         jobs = [(name, name, seed, often, 1) for seed in (1, 2, 3) for name in SCRIPTS]
     elif what == "levels":
         jobs = [
-            (name, f"{name}_{level}", seed, [*often, *flags.split()], 1)
+            (name, f"{name}_{level}", seed, [*often, *flags_of(name, level)], 1)
             for seed in (1, 2, 3)
-            for level, flags in LEVELS.items()
+            for level in LEVELS
             for name in SCRIPTS
         ]
     elif what == "timed":
         often += ["--eval-trials", "100"]
         jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
         jobs += [
-            (SCRIPTS[0], f"{SCRIPTS[0]}_{level}", 1, [*often, *flags.split()], 2)
-            for level, flags in LEVELS.items()
+            (SCRIPTS[0], f"{SCRIPTS[0]}_{level}", 1, [*often, *flags_of(SCRIPTS[0], level)], 2)
+            for level in LEVELS
         ]
     else:
         jobs = [
