@@ -181,7 +181,9 @@ def load_sb3(path: Path) -> Any:
 
         data, weights, _ = load_from_zip_file(path)
         spaces = data["observation_space"], data["action_space"]
-        policy = data["policy_class"](*spaces, lambda _: 0.0, **data["policy_kwargs"])
+        options = {"use_sde": True} if data.get("use_sde") else {}
+        options |= data["policy_kwargs"]
+        policy = data["policy_class"](*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights["policy"])
     except Exception as error:  # a missing library, a damaged file, a model of another version
         raise SystemExit(f"{path}: {error}") from None
@@ -410,8 +412,13 @@ def check_combinations(args: Args) -> None:
             f"--policy must be {', '.join(known)} or my_module:MyPolicy, got {args.policy!r}",
         ),
         (not args.diameters, "--diameters needs at least one number"),
+        (len({*args.diameters}) < len(args.diameters), "--diameters names a diameter twice"),
         (not from_file and args.path != SHIPPED, f"PATH {wrong_use}"),
         (not from_file and args.stochastic, f"--stochastic {wrong_use}"),
+        (
+            args.stochastic and args.path.suffix == ".onnx",
+            "--stochastic: an .onnx file has the mean action only",
+        ),
         (
             args.policy != "scripted" and not args.signed_yaw,
             "--no-signed-yaw is for --policy scripted; a trained policy brings its own",

@@ -31,7 +31,7 @@ import crane_runs
 import crane_trials
 import mppo_beta_crane as mppo
 from crane_options import Factor, Size, Times
-from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
+from scripted_crane import DT, HYDRAULIC, IDEAL, ScriptedCrane
 
 MARGIN = 0.005  # off 0 and 1, where the script often is: the likelihood is infinite there
 
@@ -114,9 +114,13 @@ def main(args: Args) -> None:
     run_args = args.run
     if not crane_trials.is_crane(run_args.env_id):
         raise SystemExit(f"{run_args.env_id} is not the crane, and the script drives nothing else")
+    if run_args.resume is not None:
+        raise SystemExit("--run.resume would overwrite that run; leave it to mppo_beta_crane.py")
     torch.manual_seed(run_args.seed)
     torch.set_num_threads(run_args.torch_threads)
     envs = crane_trials.make_envs(run_args.env_id, 1, **run_args.env)
+    if envs.unwrapped.dt != DT:
+        raise SystemExit("the scripted crane decides every 0.1 s: leave frame_skip at 20")
     spaces = envs.single_observation_space, envs.single_action_space
     agent = mppo.Agent(spaces[0].shape[0], spaces[1].low, spaces[1].high, run_args)
     clone(agent, demonstrate(agent, run_args, args.trials), args)

@@ -120,7 +120,7 @@ def train_ours(task: str, algorithm: str, seed: int) -> Any:
         # sb3-contrib takes the mean of the KL divergence over the action's components, we the sum
         components = gymnasium.make(task).action_space.shape[0]
         flags |= {"max-kl": MAX_KL * components, "cg-damping": CG_DAMPING * components}
-        flags |= {"cg-iterations": CG_ITERATIONS, "max-grad-norm": "inf"}
+        flags |= {"cg-iterations": CG_ITERATIONS, "max-grad-norm": 1e6}
         flags["fisher-samples"] = t.num_envs * t.num_steps  # the whole rollout, as sb3-contrib
     else:
         flags |= {"clip-coef": CLIP, "target-kl": None}

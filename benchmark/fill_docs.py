@@ -27,7 +27,6 @@ import eval_crane
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 LEVELS = ["ideal", "hydraulic", "randomized"]
-DECISIONS = {"ideal": "1.02", "hydraulic": "1.54", "randomized": "4.10"}  # million
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -98,7 +97,7 @@ def shipped() -> str:
 def seeds() -> str:
     """evaluations.csv: success, gentle success and costs of each training seed, level by level.
 
-    A run whose costs are not in the file has empty cells.
+    A dash stands for costs that were not measured, or for no success.
     """
     lines = []
     for level in LEVELS:
@@ -107,12 +106,16 @@ def seeds() -> str:
             mine = [r for r in evaluations(run, "none") if r["gentle"]]
             if not mine:
                 continue
-            line = [level, method, DECISIONS[level], ", ".join(row["seed"] for row in mine)]
+            folder, name = run.split("_", 1)
+            ends = {r["seed"]: r["decisions"][-1] / 1e6 for r in read(folder).get(name, [])}
+            trained = dict.fromkeys(f"{ends[row['seed']]:.2f}" for row in mine)
+            line = [level, method, ", ".join(trained), ", ".join(row["seed"] for row in mine)]
             for name in ("success", "gentle"):
                 numbers = [float(row[name]) for row in mine]
                 line += [joined(numbers, 1), f"{np.mean(numbers):.1f}"]
             for name in ("energy [kJ]", "up [s]"):
-                line.append(joined([float(row[name]) for row in mine if row.get(name)], 1))
+                cells = [f"{float(row[name]):.1f}" if row.get(name) else "-" for row in mine]
+                line.append(", ".join(cells) if set(cells) != {"-"} else "")
             lines.append(line)
     header = ["level", "method", "decisions [million]", "seeds"]
     header += ["success", "mean", "gentle", "mean", "energy [kJ]", "up [s]"]
@@ -141,7 +144,11 @@ def costs() -> str:
     for row in rows:
         if row["trained_on"] == row["judged_on"] and row["seed"] == "1":
             lines.append(
-                [row["trained_on"], row["method"], *[f"{float(row[head]):.2f}" for head in heads]]
+                [
+                    row["trained_on"],
+                    row["method"],
+                    *[f"{float(row[head]):.2f}" if row[head] else "" for head in heads],
+                ]
             )
     lines.sort(key=lambda line: LEVELS.index(line[0]))
     return table(["level", "method", *heads], lines)

@@ -29,7 +29,7 @@
 # - An episode of 9 s. The paper states 9 s in one place and 15 s in another.
 #
 # Two things fall along the run here, and the paper does not say that they do. The learning rate
-# falls linearly to 0. The perturbation of mPPO falls to 0 in the first half of the run.
+# falls linearly to 0. The perturbation of mPPO falls to 0 in the first 40 % of the run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

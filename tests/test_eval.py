@@ -363,6 +363,8 @@ def test_clear_errors(tmp_path, run_here, capsys):
     assert "no file nowhere.pt" in error_of("nowhere.pt")
     assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
+    assert "names a diameter twice" in error_of("--diameters", "0.5", "0.5")
+    assert "mean action only" in error_of("policy.onnx", "--stochastic")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
     assert "brings its own" in error_of("--no-signed-yaw")
     wide = error_of("--video", "lift.mp4", "--width", "4000")
