@@ -662,6 +662,7 @@ def test_next_step_autoreset():
         assert (reward[resting] == 0).all() and np.isinf(info["time_to_reach"][resting]).all()
         assert (info["termination"][resting] == "none").all() and "final_obs" not in info
         assert (info["litres"][resting] == 0).all()
+        assert np.isinf(info["time_up"][resting]).all() and (info["log_speed"][resting] == 0).all()
         np.testing.assert_array_equal(info["clearance"], expected[4]["clearance"])
         ends, rests = ends + terminated.sum() + truncated.sum(), rests + resting.sum()
     assert ends > 5 and rests == ends - (ours.resting).sum()

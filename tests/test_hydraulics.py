@@ -364,6 +364,30 @@ def test_a_pushing_rod_side_gives_no_less_energy_than_work():
     assert costs.total["work"][0] == costs.total["energy"][0] == pytest.approx(limit)
 
 
+def test_a_joint_that_only_trembles_sets_no_pressure():
+    """A boom held at its force limit beside a slew that turns at its own, lower pressure."""
+    for tremble, boom in [(1e-5, 0.0), (0.1, 3.5e5)]:  # of 0.239 rad/s, the boom's limit
+        costs = machine.Costs(1)
+        force, dq = np.zeros((1, 6)), np.zeros((1, 6))
+        force[0, :2], dq[0, :2] = (1e4, 3.5e5), (0.5, tremble)
+        costs.add(np.zeros((1, 5)), np.zeros((1, 8)), dq, force, 1.0)
+        oil = machine.oil_per_movement(np.zeros((1, 8)), dq)[0]
+        pressure = max(1e4 / oil[0], boom / oil[1])
+        flow = 0.5 * oil[0] + tremble * oil[1]
+        assert costs.total["energy"][0] == pytest.approx(flow * pressure)
+
+
+@pytest.mark.parametrize("actuators, steps", [("ideal", 5), ("hydraulic", 4)])
+def test_force_on_the_ground_is_that_of_the_piece_just_made(actuators, steps):
+    """Costs are added after each piece of a decision: as many forces as the piece has steps."""
+    envs = CraneVectorEnv(2, actuators=actuators)
+    envs.reset(seed=0)
+    seen = []
+    envs.costs.add = lambda ground, *_: seen.append(ground.shape)
+    envs.advance(np.zeros((2, 6)))
+    assert seen == [(2, steps)] * (20 // steps)
+
+
 # ---- randomize
 
 

@@ -8,6 +8,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import crane_task
 import crane_trials
+import eval_crane
 from crane_env import CraneVectorEnv
 from sb3_crane import CraneVecEnv
 
@@ -65,6 +66,16 @@ def test_attributes_and_options():
         CraneVecEnv(2, autoreset_mode="NextStep")
     with pytest.raises(ValueError, match="Pendulum-v1 is not the crane"):
         CraneVecEnv(2, "Pendulum-v1")
+
+
+def test_a_model_with_state_dependent_exploration_loads(tmp_path):
+    model = PPO("MlpPolicy", CraneVecEnv(2), use_sde=True, device="cpu")
+    model.save(tmp_path / "model.zip")
+    obs = np.random.default_rng(0).normal(size=(3, 18)).astype(np.float32)
+    loaded = eval_crane.load_sb3(tmp_path / "model.zip")
+    np.testing.assert_array_equal(
+        loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]
+    )
 
 
 def test_sb3_trains_saves_and_is_judged(tmp_path, monkeypatch):
