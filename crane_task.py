@@ -191,7 +191,8 @@ def reward_terms(
     kind "paper" is Sec. IV-B2 as printed. "staged" pays r_grapple near the log's centre, r_lift if
     the log is lifted there, and r_balance while both jaws hold it (docs/environment.md says why).
     r_ground punishes hitting the ground. An easy task forgives it: a crane that does not lift yet
-    would learn to stay away.
+    would learn to stay away. actuators "hydraulic": a grip of both jaws earns all of r_grapple,
+    empty jaws at most half, and a lift pays in full where the tips are deep (`grip_depth`).
     """
     r_ground = np.zeros_like(distance)
     r_distance = np.exp(-OMEGA2 * distance)
