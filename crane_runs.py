@@ -131,7 +131,8 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
         task, written_by = checkpoint["task"], checkpoint["algorithm"]
         revision = task.get("revision", crane_env.REVISION)  # only the crane has one
         if (written_by, revision) != (algorithm, crane_env.REVISION):
-            raise SystemExit(f"--resume: {path} is of {written_by}, task revision {revision}")
+            mend = f"; this is {algorithm}, task revision {crane_env.REVISION}"
+            raise SystemExit(f"--resume: {path} is of {written_by}, task revision {revision}{mend}")
         if not {"weights", "optimizer", "iteration"} <= checkpoint.keys():
             raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since

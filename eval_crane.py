@@ -502,9 +502,9 @@ def main() -> None:
             print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
-            papers_drives = all_options["actuators"] == "ideal"
-            paper = PAPER.get(noise, {}) if papers_drives else {}
-            title = TITLES[noise] if papers_drives else "Hydraulic drives"
+            papers_task = env_id in ("ForestryCrane-v0", "ForestryCranePaper-v0")
+            paper = PAPER.get(noise, {}) if papers_task else {}
+            title = TITLES[noise] if papers_task else "Trials"
             print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")
     print(end="", flush=True)
 

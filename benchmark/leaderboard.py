@@ -106,6 +106,8 @@ def main() -> None:
     new = {name: getattr(args, name) for name in COLUMNS[:-1]} | {"revision": crane_env.REVISION}
     new |= score(args.policy, args.level)
     same = [row for row in rows if (row["method"], row["level"]) == (args.method, args.level)]
+    if same:
+        print(f"replaced: {same[0]}")
     rows = [row for row in rows if row not in same] + [new]
     unfinished = args.board.with_suffix(".tmp")
     with unfinished.open("w", newline="") as file:

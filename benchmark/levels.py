@@ -176,7 +176,13 @@ def main(
     trials: Annotated[int, Range(1, 10_000)] = 100,
     seed: Seed = 40_000,
 ) -> None:
-    """trials: per log diameter; seed: of the trials."""
+    """Measure or draw.
+
+    Args:
+        what: the matrix of levels, the sweeps, or the figure of the sweeps
+        trials: trials per log diameter
+        seed: seed of the trials
+    """
     crane_options.check({"trials": trials, "seed": seed}, main)
     torch.set_num_threads(1)
     protocol = {"per_diameter": trials, "trial_seed": seed}

@@ -568,9 +568,10 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
     for name in ("text", "empty"):
         (tmp_path / name).mkdir()
     (tmp_path / "text" / "checkpoint.pt").write_text("no checkpoint")
+    here = f"; this is {algorithm}, task revision {crane_env.REVISION}"
     for name, reason in [
-        ("other", f"is of other, task revision {crane_env.REVISION}"),
-        ("task", f"is of {algorithm}, task revision {crane_env.REVISION - 1}"),
+        ("other", f"is of other, task revision {crane_env.REVISION}{here}"),
+        ("task", f"is of {algorithm}, task revision {crane_env.REVISION - 1}{here}"),
         ("more", "is damaged or not of this script"),
         ("policy", "lacks what a checkpoint has, as a policy.pt does"),
         ("old", "is damaged or not of this script"),
