@@ -229,7 +229,8 @@ def test_the_contact_model_reported_is_the_one_judged(run_here, monkeypatch):
     def one_failure(policy, env_id, options, args):
         envs = crane_trials.make_envs(env_id, 1, **options)
         judged.append(envs.unwrapped.options["contact"])
-        record = {"success": False, "gentle": False, "time_to_reach": 1.0, "centre_miss": 0.0}
+        record = {name: 0.0 for name in crane_env.CARE} | {"success": False}
+        record |= {"time_to_reach": 1.0, "centre_miss": 0.0}
         return [{"diameter": 0.5, "failure": "overspeed", **record}]
 
     monkeypatch.setattr(eval_crane, "judge", one_failure)
