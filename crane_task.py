@@ -208,6 +208,7 @@ def reward_terms(
         grip = np.exp(-((miss / LIFT_MISS) ** 2))
         if actuators == "hydraulic":
             closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
+            # nothing for tips half a radius above the log's centre, all for half a radius below it
             grip *= np.clip(0.5 + grip_depth(state), 0, 1)
         r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground

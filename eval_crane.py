@@ -376,7 +376,7 @@ def print_table(records: list[dict], cells: list[dict], paper: dict, title: str)
 
 
 def mean_costs(trials: list[dict]) -> dict[str, float]:
-    """CARE_COLUMNS over trials by heading; time_up over the successes, NaN without any."""
+    """Average of each of CARE_COLUMNS, by heading. time_up is that of successes, NaN if none."""
     costs = {}
     for head, key, factor, mean in CARE_COLUMNS:
         values = [r[key] for r in trials if key != "time_up" or r["success"]]

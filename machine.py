@@ -77,7 +77,7 @@ DRAWN = {
     "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
 }
 OF_DRIVES = {"stiffness", "damping", "extra_delay", "gain"}  # of DRAWN; the ideal crane has none
-MOVING = 0.01  # share of its speed limit above which a joint takes oil, and not only trembles
+MOVING = 0.01  # share of its speed limit below which a joint only trembles
 COSTS = ["ground_peak", "ground_impulse", "ground_time", "litres", "energy", "work", "swing_peak"]
 
 

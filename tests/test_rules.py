@@ -168,7 +168,7 @@ def test_grip_depth():
     + [("ideal", 0.7566, 1.0)],
 )
 def test_with_drives_a_lift_pays_for_tips_below_the_logs_centre(actuators, height, share):
-    """On the tips all of the lift is lost 0.5 radii above the centre, none 0.5 radii below."""
+    """Tips half a radius above the centre earn nothing, half a radius below it they earn all."""
     lifted = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4.0, 6.0, 0.25 + height])
     lifted.q[0, 7] = np.pi / 2
     still = np.zeros((1, 6))
