@@ -18,6 +18,7 @@ from pathlib import Path
 import make_runs
 import numpy as np
 import plot_curves
+import tyro
 from plot_curves import PAPER, Run, read, recorded
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -322,6 +323,10 @@ def filled(text: str) -> str:
     return text
 
 
-if __name__ == "__main__":
+def main() -> None:
     for path in DOCUMENTS:
         path.write_text(filled(path.read_text()))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

@@ -45,8 +45,8 @@ class Args:
     """check rows, or add one"""
     method: str = ""
     """name of the method; check: its rows only"""
-    level: Literal["ideal", "hydraulic", "randomized"] = "ideal"
-    """level of the new row"""
+    level: Literal["ideal", "hydraulic", "randomized"] | None = None
+    """add: level of the new row"""
     policy: str = ""
     """of the new row: a file as eval_crane.py takes it, scripted, or my_module:MyPolicy"""
     training: str = ""
@@ -101,8 +101,8 @@ def main() -> None:
     if args.what == "check":
         wrong = check(rows, args.method)
         raise SystemExit("\n".join(wrong) or 0)
-    if not args.method or not args.policy:
-        raise SystemExit("add needs --method and --policy")
+    if not (args.method and args.level and args.policy):
+        raise SystemExit("add needs --method, --level and --policy")
     new = {name: getattr(args, name) for name in COLUMNS[:-1]} | {"revision": crane_env.REVISION}
     new |= score(args.policy, args.level)
     same = [row for row in rows if (row["method"], row["level"]) == (args.method, args.level)]

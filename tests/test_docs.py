@@ -146,7 +146,9 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
 
     call("add", "--method", "mine", "--policy", "model.zip", "--level", "hydraulic")
     call("add", "--method", "mine", "--policy", "better.zip", "--level", "hydraulic")
-    call("add", "--method", "mine", "--policy", "model.zip")
+    call("add", "--method", "mine", "--policy", "model.zip", "--level", "ideal")
+    with pytest.raises(SystemExit, match="add needs --method, --level and --policy"):
+        call("add", "--method", "mine", "--policy", "model.zip")
     rows = list(csv.DictReader(board.open()))
     assert [(row["level"], row["policy"]) for row in rows] == [
         ("hydraulic", "better.zip"),
