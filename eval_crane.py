@@ -93,8 +93,8 @@ class Args:
     csv: Path | None = None
     """write one row a trial to this file, in SI units (docs/compare.md)"""
     json: bool = False
-    """print one JSON object and nothing else: one table, without pose errors unless asked for; rates
-    are shares in [0, 1]"""
+    """print one JSON object and nothing else: one table, without pose errors unless asked for.
+    Its rates are shares in [0, 1]"""
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     camera: Literal["overview", "side", "grapple"] = "overview"
