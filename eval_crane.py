@@ -91,7 +91,7 @@ class Args:
     env_threads: Threads = 0
     """physics threads, 0 for all cores"""
     csv: Path | None = None
-    """write one row a trial to this file, in SI units (docs/compare.md)"""
+    """write one row a trial to this file; docs/compare.md has its columns and units"""
     json: bool = False
     """print one JSON object and nothing else: one table, without pose errors unless asked for.
     Its rates are shares in [0, 1]"""
