@@ -134,7 +134,9 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     """
     path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
-        raise SystemExit(f"no file {path}; train one first, or give the path of a run's policy.pt")
+        built_in = str(path) in ("scripted", "zero", "random")
+        mend = f"--policy {path}" if built_in else "train one first, or give a run's policy.pt"
+        raise SystemExit(f"no file {path}; {mend}")
     if path.suffix == ".zip":
         return load_sb3(path), {"env_id": "ForestryCrane-v0"}, "Stable-Baselines3"
     if path.suffix == ".onnx":

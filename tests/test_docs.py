@@ -145,7 +145,10 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
         leaderboard.main()
 
     call("add", "--method", "mine", "--policy", "model.zip", "--level", "hydraulic")
+    assert "replaced" not in capsys.readouterr().out
     call("add", "--method", "mine", "--policy", "better.zip", "--level", "hydraulic")
+    replaced, _ = capsys.readouterr().out.splitlines()
+    assert replaced.startswith("replaced: ") and "'policy': 'model.zip'" in replaced
     call("add", "--method", "mine", "--policy", "model.zip", "--level", "ideal")
     with pytest.raises(SystemExit, match="add needs --method, --level and --policy"):
         call("add", "--method", "mine", "--policy", "model.zip")

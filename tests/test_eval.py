@@ -362,6 +362,7 @@ def test_clear_errors(tmp_path, run_here, capsys):
         return " ".join(box.split()) if error.value.code == 2 else str(error.value)
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
+    assert "no file scripted; --policy scripted" in error_of("scripted")
     assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
     assert "names a diameter twice" in error_of("--diameters", "0.5", "0.5")
