@@ -205,19 +205,20 @@ def reward_terms(
     else:
         near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
         held = state.touching.all(axis=-1)
-        grip = np.exp(-((miss / LIFT_MISS) ** 2))
+        centred = np.exp(-((miss / LIFT_MISS) ** 2))
+        grip = centred
         if actuators == "hydraulic":
             closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
             # nothing for tips half a radius above the log's centre, all for half a radius below it
-            grip *= np.clip(0.5 + grip_depth(state), 0, 1)
+            grip = centred * np.clip(0.5 + grip_depth(state), 0, 1)
         r_grapple = GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed
         clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
         height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
         calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
-        lift, r_carry = grip * height, CARRY_WEIGHT * grip * held * state.carried
+        lift, r_carry = grip * height, CARRY_WEIGHT * centred * held * state.carried
         r_lift, r_balance = LIFT_WEIGHT * lift + r_carry, BALANCE_WEIGHT * calm * held * lift
         hardness = np.clip(2 * ground / GENTLE_FORCE - 1, 0, GROUND_MOST[actuators])
-        r_ground = -GROUND_WEIGHT[actuators] * difficulty**2 * hardness
+        r_ground = -GROUND_WEIGHT[actuators] * difficulty**4 * hardness
     return np.array([r_distance, r_grapple, r_lift, r_balance, r_ground])
 
 

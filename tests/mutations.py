@@ -144,7 +144,7 @@ MUTATIONS = [
     Mutation(
         "an easy task punishes as the full one",
         ("crane_task.py",),
-        "* difficulty**2 *",
+        "* difficulty**4 *",
         "*",
         "test_rules -k ground",
     ),
@@ -263,8 +263,8 @@ MUTATIONS = [
     Mutation(
         "one jaw is enough to carry",
         ("crane_task.py",),
-        "CARRY_WEIGHT * grip * held * state.carried",
-        "CARRY_WEIGHT * grip * state.carried",
+        "CARRY_WEIGHT * centred * held * state.carried",
+        "CARRY_WEIGHT * centred * state.carried",
         "test_rules -k carrying",
     ),
     Mutation(
