@@ -19,10 +19,8 @@ POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
 POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 Q8_MAX = 3.0  # rad
-JAW_LENGTH, PIVOT_HEIGHT = (
-    0.8566,
-    0.5,
-)  # m, from a jaw's pivot to its tip; from p_C up to the pivots
+JAW_LENGTH = 0.8566  # m, from a jaw's pivot to its tip
+PIVOT_HEIGHT = 0.5  # m, from p_C up to the pivots
 
 TIME_LIMIT = 9.0  # s, of an episode
 REACH_TIME = 6.0  # s, by which the log must have been reached

@@ -41,7 +41,7 @@ from crane_options import Range, Seed, Threads
 from crane_task import CONDITIONS, D_MAX, D_MIN, DIAMETERS
 from crane_trials import make_envs, monte_carlo_trials, run_trials
 from crane_view import film, show, whole_file
-from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
+from scripted_crane import DT, HYDRAULIC, IDEAL, ScriptedCrane
 
 SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
 ALGORITHMS = {script.ALGORITHM: script for script in SCRIPTS}
@@ -474,6 +474,8 @@ def main() -> None:
     if wanted is not None and wanted.shape != observed.shape:  # of Stable-Baselines3
         raise SystemExit(f"{source} observes {wanted.shape}; {env_id} gives {observed.shape}")
     if args.policy == "scripted":
+        if crane.dt != DT:
+            raise SystemExit(f"the scripted crane decides every {DT} s, not every {crane.dt} s")
         settings = HYDRAULIC if all_options["actuators"] == "hydraulic" else IDEAL
         policy = ScriptedCrane(args.signed_yaw, settings)
     torch.set_num_threads(1)  # the batches are too small for more

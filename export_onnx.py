@@ -57,6 +57,8 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
     """policy: a run's folder or a policy.pt; file: the .onnx file to write."""
     crane_runs.one_line_errors()
     agent, task, algorithm = eval_crane.load_policy(policy)
+    if not hasattr(agent, "obs_mean"):
+        raise SystemExit(f"{policy} is no policy.pt of this repository's scripts")
     obs = torch.zeros(2, agent.obs_mean.shape[0])
     state = agent.initial_state(2) if hasattr(agent, "initial_state") else ()
     inputs = ["obs", "h", "c"][: 1 + len(state)]

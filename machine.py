@@ -189,7 +189,7 @@ class Valves:
 
         command (n, 6) in rad/s and m/s, q (n, ...) the joints, rad and m. A valve follows its
         command as a first-order lag. A resting telescope's load-holding valve opens late. If all
-        joints ask for more oil than the pump gives, all get the same share.
+        joints ask for more oil than the pump gives, all get the same share of what they ask for.
         """
         speed, telescope = self.speed[ids], command[:, 3]
         resting = (np.abs(speed[:, 3]) < 1e-3) & (np.abs(telescope) >= 1e-3)

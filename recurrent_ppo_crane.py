@@ -338,7 +338,8 @@ if __name__ == "__main__":
         report = {"time/updates": iteration}
         report |= {name: np.mean(values) for name, values in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
-        report["losses/explained_variance"] = 1 - (advantages.var() / (returns.var() + 1e-8)).item()
+        unexplained = (advantages.var() / (returns.var() + 1e-8)).item()
+        report["losses/explained_variance"] = 1 - unexplained
         report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
         report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}

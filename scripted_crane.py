@@ -178,7 +178,7 @@ class ScriptedCrane:
         """Angle to the log (N,) in rad from Delta_psi (N,) = 1 - |cos|, which hides its sign.
 
         The first observation leaves two yaws for the log, and the rotator turns towards one of
-        them. Which of them Delta_psi has followed better since, that is the log's.
+        them. The log's yaw is the one that has predicted Delta_psi better since.
         """
         cosine = (1 - delta_psi) / np.linalg.norm(grapple_axis[:, :2], axis=-1)  # undo the tilt
         angle = np.arccos(np.clip(cosine, 0, 1))

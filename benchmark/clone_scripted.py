@@ -124,7 +124,7 @@ def main(args: Args) -> None:
     spaces = envs.single_observation_space, envs.single_action_space
     agent = mppo.Agent(spaces[0].shape[0], spaces[1].low, spaces[1].high, run_args)
     clone(agent, demonstrate(agent, run_args, args.trials), args)
-    optimizer = torch.optim.Adam(agent.parameters(), lr=run_args.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(agent.parameters(), run_args.learning_rate, eps=1e-5, fused=True)
     run = crane_runs.Run(mppo.ALGORITHM, run_args, envs, agent, optimizer, None)
     scores = run.evaluate("eval", run_args.eval_trials, iteration=0)
     run.save(iteration=0)

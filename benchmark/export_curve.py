@@ -47,12 +47,14 @@ def export(run_dir: Positional[Path], csv_path: Positional[Path]) -> None:
     for row in rows.values():
         row["wall_time_s"] = round(row.pop("wall_time") - start, 1)
     csv_path.parent.mkdir(parents=True, exist_ok=True)
-    with open(csv_path, "w", newline="") as file:
+    part = csv_path.with_suffix(".part")  # a CSV file says that the run is finished
+    with open(part, "w", newline="") as file:
         writer = csv.DictWriter(
             file, ["decisions", "wall_time_s", *dict.fromkeys(COLUMNS.values())]
         )
         writer.writeheader()
         writer.writerows(rows[step] for step in sorted(rows))
+    part.replace(csv_path)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def check(rows: list[dict[str, str]], method: str) -> list[str]:
         raise SystemExit(f"the leaderboard has no method {method!r}")
     for row in tqdm(chosen, unit="row"):
         for name, now in score(row["policy"], row["level"]).items():
-            if abs(now - float(row[name])) > TOLERANCE:
+            if round(abs(now - float(row[name])), 1) > TOLERANCE:
                 of = f"{row['method']} on {row['level']}"
                 wrong.append(f"{of}: {name} is {now} %, the row says {row[name]} %")
     return wrong

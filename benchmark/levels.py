@@ -1,4 +1,4 @@
-"""Table III: policies on the three levels, what their trials cost, and how robust they are.
+"""Policies on the three levels, what their trials cost, and how robust they are.
 
     python benchmark/levels.py table     # shipped policies and the scripted crane, on every level
     python benchmark/levels.py sweeps    # the same on a hydraulic crane with one thing changed

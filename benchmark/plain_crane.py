@@ -32,8 +32,7 @@ class PlainCrane(gymnasium.Env):
         self.frame_skip, self.dt = frame_skip, frame_skip * machine.TIMESTEP
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos, data.qvel, data.act, data.ctrl
         self.sensordata, self.warnings = data.sensordata, data.warning
-        begin = model.sensor_historyadr[-1] + 7  # as in crane_env.py
-        self.ground_force = data.history[begin : begin + 15]
+        self.ground_force = data.history[-3 * model.sensor_history[-1, 0] :]  # as in crane_env.py
         self.q_at = machine.JOINTS
         self.dq_at = [machine.JOINTS[i] for i in machine.ACTUATED]
         _, integrators = np.split(model.actuator_gainprm, 2)  # after the velocity actuators
@@ -127,7 +126,7 @@ class PlainCrane(gymnasium.Env):
 
     def _look_for_hits(self) -> None:
         force = self.ground_force.tolist()
-        for i in range(0, 15, 3):
+        for i in range(0, len(force), 3):
             self.hit = max(self.hit, hypot(*force[i : i + 3]))
 
     def _within_limits(self, q: list[float], dq: list[float]) -> bool:
@@ -163,7 +162,8 @@ class PlainCrane(gymnasium.Env):
         centred = exp(-((miss / crane_task.LIFT_MISS) ** 2))
         lift = centred * height
         reward = exp(-crane_task.OMEGA2 * aim) + crane_task.LIFT_WEIGHT * lift
-        hardness = min(max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0), 1.0)
+        hardness = max(2 * self.hit / crane_task.GENTLE_FORCE - 1, 0.0)
+        hardness = min(hardness, crane_task.GROUND_MOST["ideal"])
         reward -= crane_task.GROUND_WEIGHT["ideal"] * hardness
         reward += crane_task.GRAPPLE_WEIGHT * grasp * q[7] / crane_task.Q8_MAX
         if touch[0] > 0 and touch[1] > 0:

@@ -383,6 +383,8 @@ def test_clear_errors(tmp_path, run_here, capsys):
     assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
     assert "is no file" in error_of("--csv", tmp_path)
     assert "is no file" in error_of("--csv", "/dev/full")  # renaming would replace it
+    slow = error_of("--policy", "scripted", "--env-id", "ForestryCranePaper-v0")
+    assert slow == "the scripted crane decides every 0.1 s, not every 0.005 s"
 
 
 def test_clear_errors_of_damaged_policies(tmp_path, capsys):

@@ -65,6 +65,8 @@ def test_a_model_of_stable_baselines3_is_judged(tmp_path, monkeypatch, name):
     policy, task, _ = eval_crane.load_policy(tmp_path / "model.zip")
     ours = evaluate(policy, task["env_id"], 1, 40_000)
     assert ours == evaluate(model, "ForestryCrane-v0", 1, 40_000)
+    with pytest.raises(SystemExit, match="model.zip is no policy.pt of this"):
+        export_onnx.main(tmp_path / "model.zip", tmp_path / "model.onnx")
     line = ["eval_crane.py", "model.zip", "--env-id", "ForestryCraneHydraulic-v0"]
     monkeypatch.setattr(sys, "argv", line)
     with pytest.raises(
