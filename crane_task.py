@@ -44,7 +44,7 @@ GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
 # What r_ground takes away at GENTLE_FORCE. It begins at half of it and grows linearly.
-GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 60.0}
+GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 90.0}
 # r_ground is at most this many times GROUND_WEIGHT. Stiff servos hit hard or not at all.
 GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}
 

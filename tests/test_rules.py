@@ -195,7 +195,7 @@ def test_hitting_the_ground_costs():
     """From 10 to 20 kN, with hydraulic drives to 40; less in an easy task, nothing on paper."""
     here = state(log_centre=[4.0, 6.0, 0.45], grapple_centre=[4, 6, 1])
     for kN, ideal, hydraulic in [
-        (0, 0, 0), (10, 0, 0), (15, -15, -30), (20, -30, -60), (40, -30, -180), (50, -30, -180)
+        (0, 0, 0), (10, 0, 0), (15, -15, -45), (20, -30, -90), (40, -30, -270), (50, -30, -270)
     ]:  # fmt: skip
         force = np.array([1e3 * kN])
         for actuators, expected in [("ideal", ideal), ("hydraulic", hydraulic)]:
