@@ -83,18 +83,6 @@ def results() -> str:
     return table(header, rows)
 
 
-def shipped() -> str:
-    """The leaderboard's policies of the ideal level, by file."""
-    columns = ["policy", "success_exact", "gentle_exact"]
-    columns += ["success_pose_errors", "gentle_pose_errors"]
-    rows = [row for row in rows_of("leaderboard.csv") if row["level"] == "ideal"]
-    header = ["policy", "exact pose", "gentle, exact pose", "pose errors", "gentle, pose errors"]
-    return table(
-        header,
-        [[f"`{Path(row[columns[0]]).name}`"] + [row[c] for c in columns[1:]] for row in rows],
-    )
-
-
 def seeds() -> str:
     """evaluations.csv: success, gentle success and costs of each training seed, level by level.
 
@@ -294,7 +282,6 @@ def scaling() -> str:
 TABLES = {
     "leaderboard": leaderboard,
     "results": results,
-    "shipped": shipped,
     "seeds": seeds,
     "matrix": matrix,
     "costs": costs,

@@ -26,6 +26,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import numpy as np
+import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
@@ -126,4 +127,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     crane_runs.one_line_errors()
-    main()
+    tyro.cli(main, description=__doc__)
