@@ -110,8 +110,9 @@ def share_arguments(algorithm: str, arguments: type, description: str) -> tuple[
     if dist.get_rank() == 0:
         try:
             shared = [read_arguments(algorithm, arguments, description)]
-        except SystemExit as error:
-            code = error.code if isinstance(error.code, int | None) else 1
+        except (SystemExit, OSError) as error:
+            code = getattr(error, "code", 1)  # 0 or 2 after --help or a wrong argument
+            code = code if isinstance(code, int | None) else 1
             dist.broadcast_object_list([code])
             raise
     dist.broadcast_object_list(shared)
@@ -197,6 +198,10 @@ class Run:
         if checkpoint is not None:
             agent.load_state_dict(checkpoint["weights"])
             optimizer.load_state_dict(checkpoint["optimizer"])
+            actions = fingerprint(agent, self.spaces["obs_dim"])
+            if not torch.allclose(actions, checkpoint.get("fingerprint", actions), atol=1e-3):
+                wrote = f"that of {checkpoint['script']}, which began the run"
+                raise SystemExit(f"--resume: the Agent of this script acts otherwise than {wrote}")
             torch.manual_seed(self.env_seed)
             if done == self.num_iterations:
                 self.final_scores = checkpoint.get("final_scores", {})

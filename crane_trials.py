@@ -68,9 +68,9 @@ def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[
         report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
         if ends:
             report["charts/gentle_rate"] = np.mean([info["gentle"][i] for info, i in ends])
-        endings = [info["termination"][i] for info, i in ends]
-        for name in TERMINATIONS:
-            report[f"termination/{name}"] = endings.count(name) / max(1, len(endings))
+            endings = [info["termination"][i] for info, i in ends]
+            for name in TERMINATIONS:
+                report[f"termination/{name}"] = endings.count(name) / len(ends)
     return report
 
 

@@ -379,10 +379,14 @@ def print_table(records: list[dict], cells: list[dict], paper: dict, title: str)
 
 
 def mean_costs(trials: list[dict]) -> dict[str, float]:
-    """Average of each of CARE_COLUMNS, by heading. time_up is that of successes, NaN if none."""
+    """Average of each of CARE_COLUMNS, by heading, NaN if there is none.
+
+    The force on the ground is that of all trials. All else is of successes: a trial that ends
+    early would look cheap.
+    """
     costs = {}
     for head, key, factor, mean in CARE_COLUMNS:
-        values = [r[key] for r in trials if key != "time_up" or r["success"]]
+        values = [r[key] for r in trials if key.startswith("ground") or r["success"]]
         costs[head] = factor * mean(values).item() if values else np.nan
     return costs
 
@@ -401,8 +405,9 @@ def print_care(records: list[dict], cells: list[dict]) -> None:
         print(f"| {' | '.join(line)} |")
     print("Gentle is success without more than 20 kN of the crane on the ground. Peak and impulse")
     print("are of that force. Work is the drives' |force x speed|. Up is the time until the log is")
-    print("safely up, over the successes. Log is the log's speed at the end. Gentle and the time")
-    print("above 20 kN are means, all others are medians.")
+    print("safely up. Log is the log's speed at the end. Gentle, force and time above 20 kN are of")
+    print("all trials, the rest is of the successes. Gentle and the time are means, all others are")
+    print("medians.")
 
 
 def check_combinations(args: Args) -> None:
@@ -507,7 +512,9 @@ def main() -> None:
             print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
-            papers_task = env_id in ("ForestryCrane-v0", "ForestryCranePaper-v0")
+            papers_task = env_id.split(":")[-1] in ("ForestryCrane-v0", "ForestryCranePaper-v0")
+            # its options may come from the policy's own training
+            papers_task &= (all_options["actuators"], all_options["randomize"]) == ("ideal", 0)
             paper = PAPER.get(noise, {}) if papers_task else {}
             title = TITLES[noise] if papers_task else "Trials"
             print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")

@@ -79,6 +79,9 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
     onnx.helper.set_model_props(model, {"algorithm": algorithm, "task": json.dumps(task)})
     with whole_file(file) as path:
         onnx.save(model, path)
+        exported = crane_runs.fingerprint(eval_crane.OnnxPolicy(path), obs.shape[1])
+        if not torch.allclose(exported, crane_runs.fingerprint(agent, obs.shape[1]), atol=1e-4):
+            raise SystemExit(f"{policy}: its Agent has another `predict`; adapt MeanAction")
     print(f"{algorithm} written to {file}")
 
 

@@ -74,7 +74,7 @@ class Args:
     perturbation: Share = 0.1  # eps at the start, half width of the perturbation of a_n
     perturbed: Annotated[float, Range(0.01, 1)] = 0.4  # share of the run in which eps falls to 0
     log_excess_init: Exponent = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
-    narrowing: Exponent = 2.5  # total rise of log(alpha - 1) and log(beta - 1) along the run
+    narrowing: Exponent = 2.5  # total rise of the actor's outputs along the run, before the bound
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
@@ -205,7 +205,7 @@ if __name__ == "__main__":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
-    if 1 in (args.minibatch_size, batch_size % args.minibatch_size):
+    if args.minibatch_size == 1 or batch_size % args.minibatch_size == 1:
         raise SystemExit("--minibatch-size leaves a single decision, with no standard deviation")
 
     def to_tensor(x: np.ndarray) -> Tensor:
@@ -239,8 +239,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        progress = iteration / run.num_iterations
-        share = progress / args.warm_up if progress < args.warm_up else 1.0
+        done = iteration / run.num_iterations
+        share = done / args.warm_up if done < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 

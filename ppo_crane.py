@@ -186,7 +186,7 @@ if __name__ == "__main__":
     args, checkpoint = crane_runs.read_arguments(ALGORITHM, Args, __doc__)
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
-    if 1 in (args.minibatch_size, batch_size % args.minibatch_size):
+    if args.minibatch_size == 1 or batch_size % args.minibatch_size == 1:
         raise SystemExit("--minibatch-size leaves a single decision, with no standard deviation")
 
     def to_tensor(x: np.ndarray) -> Tensor:
@@ -213,8 +213,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        progress = iteration / run.num_iterations
-        share = progress / args.warm_up if progress < args.warm_up else 1.0
+        done = iteration / run.num_iterations
+        share = done / args.warm_up if done < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 

@@ -236,8 +236,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        progress = iteration / run.num_iterations
-        share = progress / args.warm_up if progress < args.warm_up else 1.0
+        done = iteration / run.num_iterations
+        share = done / args.warm_up if done < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 
@@ -247,7 +247,8 @@ if __name__ == "__main__":
     rewards, dones, starts = torch.zeros((3, args.num_steps, args.num_envs), device=device)
     set_difficulty(run.first_iteration)
     next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
-    next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
+    next_start = torch.ones(args.num_envs, device=device)
+    state = agent.initial_state(args.num_envs)
     for iteration in run.iterations():
         # Schedules
         left = 1.0 - (iteration - 1.0) / run.num_iterations
@@ -261,11 +262,13 @@ if __name__ == "__main__":
         # Rollout
         rollout_start = time.time()
         torch.set_num_threads(1)  # the batches are too small for more
-        infos, first_state = [], state
+        first_state = state
+        infos = []
         for step in range(args.num_steps):
             with torch.no_grad():
                 agent.update_normalizer(next_obs)
-                obs[step], starts[step] = agent.normalize(next_obs), next_start
+                obs[step] = agent.normalize(next_obs)
+                starts[step] = next_start
                 features, state = agent.remember(obs[step][None], state, next_start[None])
                 actions[step] = agent.get_distribution(features[0]).sample()
             next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
@@ -276,7 +279,8 @@ if __name__ == "__main__":
             cut = truncated & ~terminated  # bootstrap: V stands for what the time limit cut off
             if cut.any():
                 final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))[None]
-                no_starts, cut_state = torch.zeros_like(final_obs[..., 0]), [h[cut] for h in state]
+                cut_state = [part[cut] for part in state]
+                no_starts = torch.zeros_like(final_obs[..., 0])
                 with torch.no_grad():
                     features, _ = agent.remember(final_obs, cut_state, no_starts)
                     rewards[step, cut] += gamma * agent.get_value(features[0])

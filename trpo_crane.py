@@ -294,8 +294,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        progress = iteration / run.num_iterations
-        share = progress / args.warm_up if progress < args.warm_up else 1.0
+        done = iteration / run.num_iterations
+        share = done / args.warm_up if done < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 

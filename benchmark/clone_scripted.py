@@ -128,6 +128,8 @@ def main(args: Args) -> None:
     run = crane_runs.Run(mppo.ALGORITHM, run_args, envs, agent, optimizer, None)
     scores = run.evaluate("eval", run_args.eval_trials, iteration=0)
     run.save(iteration=0)
+    if run.stop_signals:  # it came during the evaluation
+        raise SystemExit(128 + run.stop_signals[0])
     print(f"success of the cloned policy: {scores['success_rate']:.3f}")
     print(f"go on with: python mppo_beta_crane.py --resume {run.dir}")
 

@@ -153,9 +153,12 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) ->
     done, failed = len(jobs) - len(missing), False
     with ThreadPoolExecutor(1 if what == "timed" else 2) as pool:
         runs = [pool.submit(make, what, *job) for job in missing]
-        for run in tqdm(as_completed(runs), total=len(jobs), initial=done):
-            tqdm.write(run.result())
-            failed |= "stopped" in run.result()
+        try:
+            for run in tqdm(as_completed(runs), total=len(jobs), initial=done):
+                tqdm.write(run.result())
+                failed |= "stopped" in run.result()
+        finally:  # Ctrl-C and errors start no further run
+            pool.shutdown(cancel_futures=True)
     sys.exit(failed)
 
 

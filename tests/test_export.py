@@ -8,10 +8,12 @@ import numpy as np
 import onnxruntime
 import pytest
 import stable_baselines3
+import torch
 from script_runs import ALGORITHMS, ROOT
 
 import eval_crane
 import export_onnx
+import ppo_crane
 from crane_trials import evaluate
 
 
@@ -53,6 +55,21 @@ def test_the_command_writes_a_file(tmp_path):
     result = subprocess.run(line, capture_output=True, text=True)
     assert result.returncode == 0 and "mppo_beta written to" in result.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+
+
+def test_an_agent_with_another_predict_is_not_exported(tmp_path, monkeypatch):
+    """MeanAction would export what the agent does no more."""
+    predict = ppo_crane.Agent.predict
+    half = lambda *args, **kwargs: (predict(*args, **kwargs)[0] / 2, None)  # noqa: E731
+    monkeypatch.setattr(ppo_crane.Agent, "predict", half)
+    monkeypatch.setattr(eval_crane, "script_of", lambda saved, path: ppo_crane)
+    path = ROOT / "assets" / "policies" / "ppo_crane.pt"
+    saved = torch.load(path, weights_only=True)
+    saved.pop("fingerprint", None)  # as of a run of the changed script
+    torch.save(saved, tmp_path / "policy.pt")
+    with pytest.raises(SystemExit, match="another `predict`"):
+        export_onnx.main(tmp_path / "policy.pt", tmp_path / "policy.onnx")
+    assert [file.name for file in tmp_path.iterdir()] == ["policy.pt"]
 
 
 @pytest.mark.parametrize("name", ["PPO", "SAC"])

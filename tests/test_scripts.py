@@ -533,6 +533,15 @@ def test_a_stop_during_an_evaluation_keeps_the_update(
     assert checkpoint["iteration"] == 1
 
 
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_changed_network_does_not_resume(tmp_path, run_here, monkeypatch, algorithm):
+    run_here(algorithm, *small(algorithm), "--total-timesteps", "128")
+    tanh, script = torch.tanh, module(algorithm)
+    monkeypatch.setattr(script.nn.Tanh, "forward", lambda self, x: tanh(2 * x))
+    with pytest.raises(SystemExit, match="--resume: the Agent of this script acts otherwise"):
+        run_here(algorithm, "--resume", only_run(tmp_path), "--total-timesteps", "256")
+
+
 ONE_DECISION = {
     "mppo_beta": ("--num-envs 1 --num-steps 1025", "no standard deviation"),
     "ppo": ("--num-envs 3 --num-steps 3 --minibatch-size 4", "no standard deviation"),

@@ -3,6 +3,7 @@
 Every test starts processes that import torch: some seconds each.
 """
 
+import inspect
 import os
 import re
 import signal
@@ -14,6 +15,9 @@ import time
 import pytest
 import torch
 from script_runs import ROOT, only_run, scalars, small
+
+import mppo_beta_crane as mppo
+import mppo_beta_torchrun as torchrun_script
 
 PROGRAM = ROOT / "tests" / "ranks_program.py"
 SCRIPT = ROOT / "mppo_beta_torchrun.py"
@@ -46,6 +50,19 @@ def children(process, cwd):
         time.sleep(0.1)
     listed = subprocess.run(["pgrep", "-P", str(process.pid)], stdout=subprocess.PIPE, text=True)
     return map(int, listed.stdout.split())
+
+
+def test_its_formulas_are_those_of_one_process():
+    """Tests of mppo_beta_crane.py hold for it too."""
+    for name in ("layer_init", "mlp", "perturb_actions", "compute_gae"):
+        ours, theirs = (inspect.getsource(getattr(m, name)) for m in (torchrun_script, mppo))
+        assert ours == theirs
+    blocks = []  # what the time limit cut off, up to the advantages
+    for script in (torchrun_script, mppo):
+        _, found, rest = inspect.getsource(script).partition("            cut = truncated & ~")
+        assert found
+        blocks.append(rest.partition("        # Advantages")[0])
+    assert blocks[0] == blocks[1]
 
 
 def test_two_ranks_have_the_gradient_of_one(tmp_path):
