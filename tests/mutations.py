@@ -309,6 +309,13 @@ MUTATIONS = [
         "if False:",
         "test_eval -k edited",
     ),
+    Mutation(
+        "a changed network goes on with a run",
+        ("crane_runs.py",),
+        'if not torch.allclose(actions, checkpoint.get("fingerprint", actions), atol=1e-3):',
+        "if False:",
+        "test_scripts -k changed_network",
+    ),
 ]
 
 
