@@ -32,11 +32,20 @@ from tyro.conf import Positional
 HERE = Path(__file__).parent
 WRITING = threading.Lock()  # of evaluations.csv
 SCRIPTS = ("mppo_beta_crane", "trpo_crane", "ppo_crane", "recurrent_ppo_crane")
-LEVELS = {  # flags by name
-    "hydraulic": "--env-id ForestryCraneHydraulic-v0 --total-timesteps 1536000",
-    "randomized": "--env-id ForestryCraneRandomized-v0 --total-timesteps 4096000 --warm-up 0.2",
+LEVELS = {  # flags of each script on the harder levels
+    "Hydraulic": {
+        "mppo_beta_crane": "--learning-rate 4e-4",
+        "trpo_crane": "--total-timesteps 1536000 --warm-up 0.6",
+        "ppo_crane": "--total-timesteps 1536000",
+        "recurrent_ppo_crane": "--total-timesteps 1536000",
+    },
+    "Randomized": {
+        "mppo_beta_crane": "--total-timesteps 4096000 --warm-up 0.2 --perturbed 0.2",
+        "trpo_crane": "--total-timesteps 4096000 --warm-up 0.2",
+        "ppo_crane": "--total-timesteps 4096000 --warm-up 0.2",
+        "recurrent_ppo_crane": "--total-timesteps 4096000 --warm-up 0.2",
+    },
 }
-OWN = {("mppo_beta_crane", "randomized"): "--perturbed 0.2"}  # flags that the other scripts lack
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
 # Script and flags by name. At another decision rate the number of simulation steps, updates and
@@ -120,9 +129,10 @@ def evaluate(name: str, seed: int, run: Path) -> None:
         part.replace(path)
 
 
-def flags_of(script: str, level: str) -> list[str]:
-    """The flags of a training on one of LEVELS."""
-    return f"{LEVELS[level]} {OWN.get((script, level), '')}".split()
+def level_job(script: str, level: str, seed: int, flags: list[str], threads: int) -> tuple:
+    """A training on one of LEVELS, as `make` takes it."""
+    flags = [*flags, "--env-id", f"ForestryCrane{level}-v0", *LEVELS[level][script].split()]
+    return script, f"{script}_{level.lower()}", seed, flags, threads
 
 
 def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) -> None:
@@ -131,7 +141,7 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) ->
         jobs = [(name, name, seed, often, 1) for seed in (1, 2, 3) for name in SCRIPTS]
     elif what == "levels":
         jobs = [
-            (name, f"{name}_{level}", seed, [*often, *flags_of(name, level)], 1)
+            level_job(name, level, seed, often, 1)
             for seed in (1, 2, 3)
             for level in LEVELS
             for name in SCRIPTS
@@ -139,10 +149,7 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) ->
     elif what == "timed":
         often += ["--eval-trials", "100"]
         jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
-        jobs += [
-            (SCRIPTS[0], f"{SCRIPTS[0]}_{level}", 1, [*often, *flags_of(SCRIPTS[0], level)], 2)
-            for level in LEVELS
-        ]
+        jobs += [level_job(SCRIPTS[0], level, 1, often, 2) for level in LEVELS]
     else:
         jobs = [
             (script, name, seed, [*SHORT, *flags.split()], 1)

@@ -35,7 +35,7 @@ def test_each_table_stands_in_one_document():
     text = "".join(path.read_text() for path in fill_docs.DOCUMENTS)
     assert all(text.count(f"<!-- {name} -->") == 1 for name in fill_docs.TABLES)
     with pytest.raises(ValueError, match="seeds has no"):
-        fill_docs.filled("<!-- seeds -->\n<!-- shipped -->\n<!-- end -->")
+        fill_docs.filled("<!-- seeds -->\n<!-- matrix -->\n<!-- end -->")
 
 
 def test_a_changed_number_is_noticed(monkeypatch):
