@@ -28,7 +28,7 @@ def run_here(tmp_path, monkeypatch):
     def run(algorithm, *arguments, cwd=tmp_path):
         if "--resume" in arguments:
             # TensorBoard sorts a run's files by second, then by a counter as text: 10 before 9
-            time.sleep(1)
+            time.sleep(1.1)
         monkeypatch.chdir(cwd)
         file = str(ROOT / f"{algorithm}_crane.py")
         monkeypatch.setattr(sys, "argv", [file, *map(str, arguments)])

@@ -385,11 +385,6 @@ def start(algorithm, cwd, *arguments, wait_for="runs/*/checkpoint.pt", ignored=(
     raise AssertionError(f"no {wait_for} after five minutes")
 
 
-def next_second():
-    """TensorBoard reads a run's files in the order of the seconds they began in."""
-    time.sleep(1.1)
-
-
 def outcome(process):
     """What it printed until its end, which must come within two minutes."""
     try:
@@ -418,7 +413,6 @@ def test_killed_run_goes_on(tmp_path, run_here, algorithm):
     run_dir = only_run(tmp_path)
     before = torch.load(run_dir / "checkpoint.pt", weights_only=True)
     assert 10 <= before["iteration"] < 50
-    next_second()
     for _ in range(2):  # the second time all updates are done
         run_here(algorithm, "--resume", run_dir, "--torch-threads", "1", "--env-threads", "1")
         after = torch.load(run_dir / "checkpoint.pt", weights_only=True)
@@ -494,7 +488,6 @@ def test_a_stopped_run_ends_with_its_update(tmp_path, run_here, algorithm, signu
     assert updates == {4.0 * iteration}  # the update under way was finished
     checkpoint["args"]["total_timesteps"] = (iteration + 1) * 64
     torch.save(checkpoint, run_dir / "checkpoint.pt")
-    next_second()
     run_here(algorithm, "--resume", said[2])
     assert scalars(run_dir)["time/updates"] == list(range(1, iteration + 2))
 
