@@ -36,8 +36,8 @@ LEVELS = {  # flags of each script on the harder levels
     "Hydraulic": {
         "mppo_beta_crane": "--learning-rate 4e-4",
         "trpo_crane": "--total-timesteps 1536000 --warm-up 0.6",
-        "ppo_crane": "--total-timesteps 1536000",
-        "recurrent_ppo_crane": "--total-timesteps 1536000",
+        "ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4",
+        "recurrent_ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4",
     },
     "Randomized": {
         "mppo_beta_crane": "--total-timesteps 4096000 --warm-up 0.2 --perturbed 0.2",
