@@ -40,7 +40,8 @@ LEVELS = {  # flags of each script on the harder levels
         "recurrent_ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4",
     },
     "Randomized": {
-        "mppo_beta_crane": "--total-timesteps 4096000 --warm-up 0.2 --perturbed 0.2",
+        "mppo_beta_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 "
+        "--perturbed 0.2",
         "trpo_crane": "--total-timesteps 4096000 --warm-up 0.2",
         "ppo_crane": "--total-timesteps 4096000 --warm-up 0.2",
         "recurrent_ppo_crane": "--total-timesteps 4096000 --warm-up 0.2",
