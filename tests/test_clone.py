@@ -78,7 +78,7 @@ def test_the_critic_knows_what_follows():
     shown = {"obs": obs[:-1], "next_obs": obs[1:], "terminated": terminated}
     shown |= {"rewards": torch.ones(steps, cranes) * 0.1, "alive": torch.ones(steps, cranes)}
     shown["actions"] = torch.full((steps, cranes, 6), 0.5)
-    run = mppo.Args(minibatch_size=256, gamma=0.9)
+    run = mppo.Args(minibatch_size=256, gamma=0.9, hidden_sizes=(64, 64))
     args = clone_scripted.Args(clone_epochs=150, run=run)
     agent = make_agent(run)
     clone_scripted.clone(agent, shown, args)

@@ -126,7 +126,8 @@ def test_recipe_of_an_edited_script(tmp_path):
     assert copy[0] == "cp"
     edited = (ROOT / copy[1]).read_text().replace("nn.Tanh()", "nn.ELU()")
     (tmp_path / copy[2]).write_text(edited)
-    words = [sys.executable, *train[1:], "--total-timesteps", "4096", "--final-trials", "0"]
+    words = [sys.executable, *train[1:], "--total-timesteps", "64", "--num-envs", "4"]
+    words += ["--num-steps", "16", "--minibatch-size", "64", "--final-trials", "0"]
     words += ["--eval-every", "0"]
     environment = {"PYTHONPATH": str(ROOT), "PATH": ""}
     ran = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
