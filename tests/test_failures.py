@@ -139,25 +139,21 @@ def messages(errors):
 LONG = [*ECHO, "--eval-every", "0", "--total-timesteps", "640000"]
 
 
-@pytest.mark.parametrize("algorithm", ["trpo", "recurrent_ppo"])
-def test_runs_is_no_folder(tmp_path, algorithm):
+def test_runs_is_no_folder(tmp_path):
     (tmp_path / "runs").write_text("something else")
-    status, lines = ended(command(algorithm, *small(algorithm), *LONG), tmp_path)
+    status, lines = ended(command("trpo", *small("trpo"), *LONG), tmp_path)
     assert status == 1 and len(lines) == 1 and lines[0].startswith("NotADirectoryError: ")
     assert "runs/" in lines[0]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", TWO)
-def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_afterwards(
-    tmp_path, run_here, algorithm
-):
+def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_afterwards(tmp_path):
     """A limit on the size of files stands for the disk: TensorBoard's file reaches it first."""
 
     def limit():
         resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 
-    line = command(algorithm, *small(algorithm), *LONG)
+    line = command("trpo", *small("trpo"), *LONG)
     status, lines = ended(line, tmp_path, preexec_fn=limit, timeout=300)
     run_dir = only_run(tmp_path)
     assert status == 1 and len(lines) == 1
@@ -165,7 +161,7 @@ def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_afterwards(
     before = torch.load(run_dir / "checkpoint.pt", weights_only=True)["iteration"]
     assert before >= 10
     total = str(64 * (before + 20))
-    run(algorithm, tmp_path, "--resume", run_dir, "--total-timesteps", total)
+    run("trpo", tmp_path, "--resume", run_dir, "--total-timesteps", total)
     assert scalars(run_dir)["time/updates"] == list(range(1, before + 21))
 
 
