@@ -111,8 +111,8 @@ ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`.
 
-    Crane i's starts depend on the seed, on i and, with retry, on its failures. They do not depend
-    on N or on the threads.
+    Crane i's starts depend on the seed, on i and, with retry, on how its episodes ended. They do
+    not depend on N or on the threads.
 
     `info` describes the step just made, for every crane, also one whose episode just ended:
     `termination` (one of TERMINATIONS, or "none"), the reward's TERMS, `d_combine`, `clearance`,
@@ -219,7 +219,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
         self.resting = np.zeros(self.num_envs, bool)  # NEXT_STEP: ended in the step before
         self.starts: list[tuple] = [()] * self.num_envs
-        self.recent_success = deque(maxlen=200)  # of ended episodes
         self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
         draws = self.max_decisions + 1 if options["pose_noise"] == "step" else 1
         self.noise = np.zeros((self.num_envs, draws, 2))  # epsilon_p, epsilon_o
@@ -248,7 +247,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             # starts, pose noise and machines have streams of their own: one leaves the others alone
             streams = [(s, s.generate_state(4), s.generate_state(8)[4:]) for s in seeds]
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
-            self.failures = [deque(maxlen=4) for _ in seeds]
+            self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
+            self.recent_success = [deque(maxlen=10) for _ in seeds]  # of each crane's episodes
         self.resting[:] = False
         obs, info = self.start_episodes(np.arange(self.num_envs))
         return obs, info | {f"_{key}": np.ones(self.num_envs, bool) for key in info}
@@ -325,9 +325,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= {"termination": ending, "time_to_reach": self.reach_time.copy()}
         reward = sum(info[term] for term in TERMS)
         for i in np.flatnonzero(ending != "none"):
-            self.recent_success.append(bool(info["success"][i]))
+            self.recent_success[i].append(bool(info["success"][i]))
             if not info["success"][i]:
-                self.failures[i].append(self.starts[i])  # for retry
+                self.failures[i].append(self.starts[i])
         if self.render_mode == "human" and self.watch is None:
             self.render()
         return obs, np.where(diverged, 0.0, reward), terminated, truncated, info
@@ -379,7 +379,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """New episodes in cranes `ids`; observations and info of all cranes."""
         for i in ids:
             (start_rng, noise_rng, machine_rng), failures = self.rngs[i], self.failures[i]
-            retry = self.options["retry"]
+            retry = self.options["retry"] * np.mean(self.recent_success[i] or 0.0)
             if retry and failures and start_rng.random() < retry:
                 self.starts[i] = failures[start_rng.integers(len(failures))]
             else:

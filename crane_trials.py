@@ -62,8 +62,8 @@ def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[
         report["charts/episodic_return"] = np.mean([info["episode"]["r"][i] for info, i in ends])
         report["charts/episodic_length"] = np.mean([info["episode"]["l"][i] for info, i in ends])
     if isinstance(crane, CraneVectorEnv):
-        if crane.recent_success:
-            report["charts/success_rate"] = np.mean(crane.recent_success)
+        if recent := [success for outcomes in crane.recent_success for success in outcomes]:
+            report["charts/success_rate"] = np.mean(recent)
         report["schedule/difficulty"] = crane.difficulty
         report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
         if ends:

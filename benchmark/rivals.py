@@ -175,7 +175,7 @@ class TimedCranes(gymnasium.vector.VectorWrapper):
 
     def __init__(self, setting: Setting, clock: Clock):
         self.clock, self.like_mppo = clock, setting.like_mppo
-        options = {"env_threads": clock.threads, "retry": 0.25 if self.like_mppo else 0.0}
+        options = {"env_threads": clock.threads, "retry": 0.5 if self.like_mppo else 0.0}
         super().__init__(gymnasium.make_vec(TASK, setting.cranes, **options))
 
     def step(self, actions: np.ndarray) -> tuple:
