@@ -410,8 +410,12 @@ def test_retry_starts_failures_again(monkeypatch):
     """Every episode fails here, but the cranes remember other ends: the share is their product."""
     monkeypatch.setattr(crane_task, "REACH_TIME", 0.8)
     for retry, success, low, high in [
-        (0.0, 1.0, 0, 0), (0.5, 1.0, 0.35, 0.65), (1.0, 1.0, 1, 1), (1.0, 0.4, 0.3, 0.5), (1.0, 0.0, 0, 0)
-    ]:  # fmt: skip
+        (0.0, 1.0, 0, 0),
+        (0.5, 1.0, 0.35, 0.65),
+        (1.0, 1.0, 1, 1),
+        (1.0, 0.4, 0.3, 0.5),
+        (1.0, 0.0, 0, 0),
+    ]:
         envs = CraneVectorEnv(32, retry=retry)
         obs, _ = envs.reset(seed=0)
         envs.recent_success = [Remembered([success]) for _ in range(32)]
