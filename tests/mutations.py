@@ -219,6 +219,13 @@ MUTATIONS = [
         "test_failures -k range",
     ),
     Mutation(
+        "a crane that never succeeds repeats its failures",
+        ("crane_env.py",),
+        " * np.mean(self.recent_success[i] or 0.0)",
+        "",
+        "test_env -k retry",
+    ),
+    Mutation(
         "NEXT_STEP counts an end twice",
         ("crane_env.py",),
         'ending[self.resting] = "none"',
