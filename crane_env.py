@@ -248,7 +248,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             streams = [(s, s.generate_state(4), s.generate_state(8)[4:]) for s in seeds]
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
-            self.recent_success = [deque(maxlen=10) for _ in seeds]  # of each crane's episodes
+            self.recent_success = [deque(maxlen=10) for _ in seeds]  # a crane's last episodes
         self.resting[:] = False
         obs, info = self.start_episodes(np.arange(self.num_envs))
         return obs, info | {f"_{key}": np.ones(self.num_envs, bool) for key in info}

@@ -226,6 +226,13 @@ MUTATIONS = [
         "test_env -k retry",
     ),
     Mutation(
+        "a crane's repeats depend on the others' success",
+        ("crane_env.py",),
+        "self.recent_success[i] or 0.0",
+        "[x for ends in self.recent_success for x in ends] or 0.0",
+        "test_env -k retry",
+    ),
+    Mutation(
         "NEXT_STEP counts an end twice",
         ("crane_env.py",),
         'ending[self.resting] = "none"',
