@@ -90,7 +90,7 @@ class Options(TypedDict, total=False):
     axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
     pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
     difficulty: Share  # 0: easy starts, 1: the full task (1.0)
-    retry: Share  # share of episodes that repeat a failed start, times recent success (0.0)
+    retry: Share  # largest share of episodes that repeat a failed start (0.0)
     integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
     solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
 

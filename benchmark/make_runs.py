@@ -37,7 +37,7 @@ LEVELS = {  # flags of each script on the harder levels
         "mppo_beta_crane": "--learning-rate 4e-4",
         "trpo_crane": "--total-timesteps 1536000 --warm-up 0.6",
         "ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4",
-        "recurrent_ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4",
+        "recurrent_ppo_crane": "--total-timesteps 1536000",
     },
     "Randomized": {
         "mppo_beta_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 "
