@@ -9,6 +9,7 @@ Several machines, and what to expect of 8, 64 and 512 cores: docs/speed.md.
     torchrun --standalone --nproc-per-node 2 mppo_beta_torchrun.py
 """
 
+import atexit
 import os
 import time
 from collections import defaultdict
@@ -195,6 +196,8 @@ if __name__ == "__main__":
         crane_runs.read_arguments(ALGORITHM, Args, __doc__)  # --help
         raise SystemExit(f"start it as: torchrun --standalone --nproc-per-node 2 {__file__}")
     dist.init_process_group()
+    # also at an early exit, where the threads of the group may abort the rank
+    atexit.register(lambda: dist.is_initialized() and dist.destroy_process_group())
     rank, world_size = dist.get_rank(), dist.get_world_size()
     all_args, checkpoint = crane_runs.share_arguments(ALGORITHM, Args, __doc__)
     if all_args.num_envs % world_size or all_args.minibatch_size % world_size:
