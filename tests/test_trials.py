@@ -72,7 +72,7 @@ def test_make_envs_refuses_what_does_not_fit():
     for env_id in ("CartPole-v1", "FrozenLake-v1"):  # actions, and observations, of another kind
         with pytest.raises(ValueError, match="no flat Box"):
             make_envs(env_id, 2)
-    envs = make_envs("Pendulum-v1", 3, retry=0.5)  # a default of two scripts
+    envs = make_envs("Pendulum-v1", 3, retry=0.5)  # mPPO's default
     assert envs.num_envs == 3 and envs.reset(seed=0)[0].shape == (3, 3)
 
 
