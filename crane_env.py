@@ -8,7 +8,7 @@ The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (
 stages). Two passive joints q5, q6 let a rotator q7 hang down with the grapple's two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
 Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there,
-`ForestryCraneHydraulic-v0` the same crane with the drives that were measured on the machine, and in
+`ForestryCraneHydraulic-v0` the same crane with drives as measured on the machine, and in
 `ForestryCraneRandomized-v0` each episode draws a machine, a log and sensors with errors.
 Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
 
@@ -124,8 +124,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     CARE says what the episode has cost so far: `ground_peak` (N), `ground_impulse` (N s) and
     `ground_time` (s above GENTLE_FORCE) of the crane's force on the ground, `litres` of oil,
     `energy` of the pump and `work` of the drives (J), `swing_peak` (rad) of the grapple, `time_up`
-    (s until the log is safely up, inf unless it still is), `log_speed` (m/s), and `gentle`, success
-    without more than GENTLE_FORCE on the ground. With randomize, `drawn_...` say what was drawn.
+    (s, when the log was safely up; inf before, and if it is lost), `log_speed` (m/s), and `gentle`,
+    success with at most GENTLE_FORCE. With randomize, `drawn_...` say what was drawn.
     """
 
     metadata = {
@@ -181,8 +181,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
         self.metadata["autoreset_mode"] = self.autoreset_mode
 
-        engine = (options[name] for name in ("contact", "integrator", "solver", "actuators"))
-        self.model = machine.load_model(*engine, visual=render_mode is not None)
+        engine = {name: options[name] for name in ("contact", "integrator", "solver", "actuators")}
+        self.model = machine.load_model(**engine, visual=render_mode is not None)
         self.hydraulic = options["actuators"] == "hydraulic"
         self.batch = batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
         ALIVE.add(self)
@@ -194,10 +194,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # live views of the engine's arrays, one row a crane
         self.qpos, self.qvel, self.act = batch.bind("qpos"), batch.bind("qvel"), batch.bind("act")
         self.ctrl, self.qfrc_bias = batch.bind("ctrl"), batch.bind("qfrc_bias")
-        self.sensordata, self.log_size = batch.bind("sensordata"), batch.geom("log").size
-        self.log_velocity = batch.joint("log").qvel  # m/s and rad/s
-        self.drive_force = batch.bind("qfrc_actuator")
-        # the last numbers there are what the last sensor measured in the last steps: x, y, z each
+        self.drive_force, self.sensordata = batch.bind("qfrc_actuator"), batch.bind("sensordata")
+        self.log_size, self.log_velocity = batch.geom("log").size, batch.joint("log").qvel
+        # history ends with the last sensor, ground_force: x, y, z in each of the last steps
         remembered = 3 * self.model.sensor_history[-1, 0]
         self.ground_force = batch.bind("history")[:, -remembered:]
         self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
@@ -308,8 +307,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         safe = (self.streaks >= self.hold_decisions).all(axis=0)
         self.time_up = np.where(safe, np.minimum(self.time_up, time), np.inf)
 
-        limits = self.joint_range, self.speed
-        ending = crane_task.termination_rule(state, time, reached, diverged, *limits)
+        bounds, speed = self.joint_range, self.speed
+        ending = crane_task.termination_rule(state, time, reached, diverged, bounds, speed)
         ending[self.resting] = "none"
         truncated = ending == "time_limit"
         terminated = (ending != "none") & ~truncated
@@ -466,13 +465,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         delta_p, delta_psi, signed_angle = crane_task.relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
         clearance, miss = crane_task.log_clearance(state), crane_task.centre_miss(state)
-        kind, actuators = self.options["reward"], self.options["actuators"]
+        kind, drives, impact = self.options["reward"], self.options["actuators"], self.costs.impact
         info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
         info |= {"diameter": state.diameter, "log_mass": self.batch.body("log").mass[:, 0].copy()}
         above = 0.0 if kind == "paper" else crane_task.CLOSING_HEIGHT
         distance = np.linalg.norm(delta_p + [0, 0, above], axis=-1) + delta_psi
-        given = state, distance, clearance, miss, command, self.costs.impact, self.difficulty
-        terms = crane_task.reward_terms(*given, kind, actuators)
+        terms = crane_task.reward_terms(
+            state, distance, clearance, miss, command, impact, self.difficulty, kind, drives
+        )
         info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
         if self.options["randomize"]:
             info |= {f"drawn_{name}": values.copy() for name, values in self.drawn.items()}
@@ -511,7 +511,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def difficulty(self) -> float:
-        """Of the next starts and, at once, of r_ground; 0: easy, 1: the full task."""
+        """From 0 (easy) to 1 (the full task). It acts on r_ground at once, then on starts."""
         return self._difficulty
 
     @difficulty.setter

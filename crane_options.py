@@ -41,8 +41,8 @@ Exponent = Annotated[float, Range(-20, 20)]
 def check(values: Mapping[str, Any], *annotated: Any) -> None:
     """ValueError names a value that its annotation does not allow, and what it allows.
 
-    annotated: classes or functions. Checked are bools, Literals and numbers with a Range, also in
-    a tuple or beside None.
+    annotated: classes or functions. It checks bools, Literals and numbers with a Range, also inside
+    a tuple or next to None.
     """
     annotations = {}
     for each in annotated:

@@ -199,7 +199,7 @@ class Run:
             agent.load_state_dict(checkpoint["weights"])
             optimizer.load_state_dict(checkpoint["optimizer"])
             actions = fingerprint(agent, self.spaces["obs_dim"])
-            if not torch.allclose(actions, checkpoint.get("fingerprint", actions), atol=1e-3):
+            if not torch.allclose(actions, checkpoint["fingerprint"], atol=1e-3):
                 wrote = f"that of {checkpoint['script']}, which began the run"
                 raise SystemExit(f"--resume: the Agent of this script acts otherwise than {wrote}")
             torch.manual_seed(self.env_seed)

@@ -112,7 +112,7 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
-    # (N,) share of the log's weight that is in the air, less what the crane puts on the ground
+    # (N,) 1 - (force of log and crane on the ground) / (weight of the log), clipped to [0, 1]
     carried: Array | float = 0.0
 
 

@@ -152,23 +152,20 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     script = script_of(saved, path)
     if "frame_skip" not in task:
         raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
-    task = crane_options.DEFAULTS | task  # older files do not know all options
+    task = crane_options.DEFAULTS | task  # an option that is newer than the file has its default
     warn_of_revision(path, task)
     try:
-        bound = torch.ones(6)  # older files do not know their spaces, but all are the crane's
-        older = {"obs_dim": len(weights["obs_mean"]), "low": -bound, "high": bound}
-        obs_dim, low, high = (saved.get("spaces", older)[name] for name in older)
+        obs_dim, low, high = (saved["spaces"][name] for name in ("obs_dim", "low", "high"))
         agent = script.Agent(obs_dim, low.numpy(), high.numpy(), script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
     except Exception as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
         raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
-    if "fingerprint" in saved:
-        actions = crane_runs.fingerprint(agent, obs_dim)
-        if not torch.allclose(actions, saved["fingerprint"], atol=1e-3):
-            wrote = f"that of {saved['script']}, which wrote it"
-            raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
+    actions = crane_runs.fingerprint(agent, obs_dim)
+    if not torch.allclose(actions, saved["fingerprint"], atol=1e-3):
+        wrote = f"that of {saved['script']}, which wrote it"
+        raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
     return agent, task, algorithm
 
 
@@ -405,9 +402,9 @@ def print_care(records: list[dict], cells: list[dict]) -> None:
         print(f"| {' | '.join(line)} |")
     print("Gentle is success without more than 20 kN of the crane on the ground. Peak and impulse")
     print("are of that force. Work is the drives' |force x speed|. Up is the time until the log is")
-    print("safely up. Log is the log's speed at the end. Gentle, force and time above 20 kN are of")
-    print("all trials, the rest is of the successes. Gentle and the time are means, all others are")
-    print("medians.")
+    print("safely up. Log is the log's speed at the end. Gentle and > 20 kN are means over all")
+    print("trials. Peak and impulse are medians over all trials. All others are medians over the")
+    print("successes.")
 
 
 def check_combinations(args: Args) -> None:

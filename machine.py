@@ -1,4 +1,4 @@
-"""The machine: the crane's model for the simulator, and the real drives as measured on it.
+"""The machine: the crane's model, and drives as measured on the real one (the jaws' are estimated).
 
 The drives turn oil into motion. A command passes a dead time, the lag of a valve, and a spring. The
 spring's rest position moves at the commanded speed, and its force is limited. Joints are damped.

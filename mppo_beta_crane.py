@@ -5,7 +5,7 @@ The paper's own algorithm (Vu et al., Sec. IV-C). It differs from PPO in two poi
 - The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n:
   no action outside the limits (Chou et al., 2017). Its mean, alpha / (alpha + beta), is evaluated.
 - In training each sampled action is perturbed, Eq. (robust ppo): a_n <- clip(a_n + g, 0, 1) with
-  g ~ U(-eps, eps). Here eps falls to 0 in the first 40 % of the run.
+  g ~ U(-eps, eps). Here eps falls to 0 in the first part of the run.
 
 The rest is PPO (Schulman et al., 2017) with generalized advantage estimation:
 
@@ -15,7 +15,7 @@ The rest is PPO (Schulman et al., 2017) with generalized advantage estimation:
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
 V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. The executed action follows the perturbed policy, but
-rho and the KL estimate use the unperturbed Beta: while eps > 0 the estimate exceeds the true KL.
+rho and the KL estimate use the unperturbed Beta. While eps > 0 the estimate is therefore biased.
 Along the run the policy narrows, the horizon grows, the step size falls (docs/mppo_beta.md).
 
     python mppo_beta_crane.py  # the crane: minutes on two cores
@@ -113,7 +113,7 @@ def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) ->
 
 
 class Agent(nn.Module):
-    """Actor, critic and observation normalizer. Only `predict` takes raw observations."""
+    """Actor, critic and observation normalizer. The networks take normalized observations."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
@@ -177,7 +177,7 @@ def perturb_actions(actions: Tensor, epsilon: float) -> Tensor:
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values, episode ends (T, N) and the value after them (N,).
+    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
     No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
     already added gamma * V(final_obs) to the reward.
@@ -213,7 +213,7 @@ if __name__ == "__main__":
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
     physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
 
     # Agent
     torch.manual_seed(args.seed)

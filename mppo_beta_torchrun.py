@@ -102,7 +102,7 @@ def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) ->
 
 
 class Agent(nn.Module):
-    """Actor, critic and observation normalizer. Only `predict` takes raw observations."""
+    """Actor, critic and observation normalizer. The networks take normalized observations."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
@@ -167,7 +167,7 @@ def perturb_actions(actions: Tensor, epsilon: float) -> Tensor:
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values, episode ends (T, N) and the value after them (N,).
+    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
     No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
     already added gamma * V(final_obs) to the reward.
@@ -225,7 +225,7 @@ if __name__ == "__main__":
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
     physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
 
     # Agent
     torch.manual_seed(args.seed)

@@ -2,9 +2,8 @@ r"""PPO: proximal policy optimization with a Gaussian policy, on the crane.
 
 The paper's first baseline (Vu et al., Sec. V-A), after Schulman et al., 2017:
 
-- The policy is a ~ N(mu(s), sigma^2). Its standard deviation does not depend on the state. It knows
-  no limits: the environment gets the action clipped to them. Its mean mu(s) is what an evaluation
-  takes.
+The policy is a ~ N(mu(s), sigma^2), with one sigma for all states. An action is clipped to the
+environment's limits only when it is executed. An evaluation takes the mean mu(s).
 
 With generalized advantage estimation:
 
@@ -14,7 +13,6 @@ With generalized advantage estimation:
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
 V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
-
 Along the run the policy narrows, the horizon grows, the step size falls (docs/ppo.md).
 
     python ppo_crane.py  # the crane: minutes on two cores
@@ -110,7 +108,7 @@ def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) ->
 
 
 class Agent(nn.Module):
-    """Actor, critic and observation normalizer. Only `predict` takes raw observations."""
+    """Actor, critic and observation normalizer. The networks take normalized observations."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
@@ -167,7 +165,7 @@ class Agent(nn.Module):
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values, episode ends (T, N) and the value after them (N,).
+    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
     No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
     already added gamma * V(final_obs) to the reward.
@@ -201,7 +199,7 @@ if __name__ == "__main__":
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
     physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
 
     # Agent
     torch.manual_seed(args.seed)

@@ -1,8 +1,8 @@
 """Recurrent PPO: proximal policy optimization with an LSTM as memory, on the crane.
 
 The paper's third baseline (Vu et al., Sec. V-A), after Schulman et al., 2017, and Hochreiter and
-Schmidhuber, 1997. One observation does not tell the log's diameter or how fast the grapple swings.
-A policy with a memory can infer both:
+Schmidhuber, 1997. One observation of ForestryCrane-v0 tells neither the log's diameter nor how fast
+the grapple swings. A policy with a memory can infer both:
 
 - h_t, c_t = LSTM(o_t, h_{t-1}, c_{t-1}). Both are 0 before the first observation of an episode.
 - The policy is a ~ N(mu(o_t, h_t), sigma^2), the value is V(o_t, h_t). The rest is PPO.
@@ -10,7 +10,6 @@ A policy with a memory can infer both:
   the state that its crane had when the rollout began.
 
 Advantages A, returns R, the loss and what the time limit does are those of ppo_crane.py.
-
 Along the run the policy narrows, the horizon grows, the step size falls (docs/recurrent_ppo.md).
 
     python recurrent_ppo_crane.py  # the crane: minutes on two cores
@@ -107,7 +106,7 @@ def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) ->
 
 
 class Agent(nn.Module):
-    """Actor, critic and observation normalizer. Only `predict` takes raw observations."""
+    """Actor, critic and observation normalizer. The networks take normalized observations."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
@@ -190,7 +189,7 @@ class Agent(nn.Module):
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values, episode ends (T, N) and the value after them (N,).
+    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
     No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
     already added gamma * V(final_obs) to the reward.
@@ -224,7 +223,7 @@ if __name__ == "__main__":
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
     physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
 
     # Agent
     torch.manual_seed(args.seed)
@@ -292,7 +291,7 @@ if __name__ == "__main__":
             features, _ = agent.remember(obs, first_state, starts)
             values = agent.get_value(features)
             logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
-            # one step ahead, while the live state stays where it is
+            # V(next_obs) needs the memory one step later. The rollout's own memory stays as it is.
             features, _ = agent.remember(agent.normalize(next_obs)[None], state, next_start[None])
             next_value = agent.get_value(features[0])
         advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda**tenths)

@@ -2,9 +2,9 @@
 
 The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 
-- The policy is a ~ N(mu(s), sigma^2) as in PPO. Its mean mu(s) is what an evaluation takes.
-- Each rollout allows one step s of the policy: the natural gradient's direction, as long as the
-  mean KL divergence from the old policy permits.
+- The policy is a ~ N(mu(s), sigma^2) as in PPO. An evaluation takes the mean mu(s).
+- Each rollout allows one step s of the policy. It goes along the natural gradient, so far that the
+  mean KL divergence from the old policy stays within delta.
 
     max g^T s   subject to   1/2 s^T F s <= delta         g = grad E[rho A]
     s = sqrt(2 delta / x^T F x) x,   F x = g              F = H + d I
@@ -113,7 +113,7 @@ def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) ->
 
 
 class Agent(nn.Module):
-    """Actor, critic and observation normalizer. Only `predict` takes raw observations."""
+    """Actor, critic and observation normalizer. The networks take normalized observations."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
@@ -247,7 +247,7 @@ def line_search(
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) from rewards, values, episode ends (T, N) and the value after them (N,).
+    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
     No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
     already added gamma * V(final_obs) to the reward.
@@ -281,7 +281,7 @@ if __name__ == "__main__":
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
     physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # of a second in a decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
 
     # Agent
     torch.manual_seed(args.seed)
@@ -351,7 +351,7 @@ if __name__ == "__main__":
         batch = (b_obs, b_actions, adv, old)
         surrogate, _ = surrogate_and_kl(agent, *batch)
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-        # A sample gives the direction, the whole rollout its length.
+        # A sample of the rollout gives the direction. The whole rollout gives the length.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
         matvec = fisher_product(agent, b_obs[sample], args.cg_damping)
         direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
