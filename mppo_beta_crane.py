@@ -320,7 +320,7 @@ if __name__ == "__main__":
         now = time.time()
         sps = batch_size / (now - rollout_start)
         report = {"time/updates": iteration, "schedule/perturbation": epsilon}
-        report |= {name: np.mean(values) for name, values in stats.items()}
+        report |= {name: np.mean(numbers) for name, numbers in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
         unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
         report["losses/explained_variance"] = 1 - unexplained
