@@ -39,7 +39,7 @@ LEVELS = {  # flags of each script on the harder levels
         "trpo_crane": "--total-timesteps 1536000 --warm-up 0.6",
         "ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4 --num-envs 128 "
         "--minibatch-size 2048",
-        "recurrent_ppo_crane": "--total-timesteps 1536000",
+        "recurrent_ppo_crane": "--total-timesteps 1536000 --num-envs 128 --env.retry 0.5",
     },
     "Randomized": {
         "mppo_beta_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 "
@@ -47,7 +47,8 @@ LEVELS = {  # flags of each script on the harder levels
         "trpo_crane": "--total-timesteps 4096000 --warm-up 0.2",
         "ppo_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 --num-envs 128 "
         "--minibatch-size 2048",
-        "recurrent_ppo_crane": "--total-timesteps 4096000 --warm-up 0.2",
+        "recurrent_ppo_crane": "--total-timesteps 4096000 --warm-up 0.2 --num-envs 128 "
+        "--env.retry 0.5",
     },
 }
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
