@@ -134,7 +134,7 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
         if (written_by, revision) != (algorithm, crane_env.REVISION):
             mend = f"; this is {algorithm}, task revision {crane_env.REVISION}"
             raise SystemExit(f"--resume: {path} is of {written_by}, task revision {revision}{mend}")
-        if not {"weights", "optimizer", "iteration"} <= checkpoint.keys():
+        if not {"weights", "optimizer", "iteration", "fingerprint"} <= checkpoint.keys():
             raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since
         options = {name: task[name] for name in DEFAULTS if name in task}

@@ -18,6 +18,7 @@ import torch
 
 import crane_env
 import crane_options
+import crane_runs
 import crane_task
 import crane_trials
 import eval_crane
@@ -304,8 +305,16 @@ def test_acts_as_the_agent_of_any_algorithm(tmp_path, script):
         agent.actor[-1].weight.mul_(100)
     weights = {k: v for k, v in agent.state_dict().items() if not k.startswith("critic.")}
     task = {"env_id": CRANE, "revision": crane_env.REVISION, **crane_options.DEFAULTS}
-    policy = {"algorithm": script.ALGORITHM, "args": asdict(args), "weights": weights}
-    torch.save(policy | {"task": task}, tmp_path / "policy.pt")
+    low, high = agent.action_low, agent.action_high
+    policy = {
+        "algorithm": script.ALGORITHM,
+        "args": asdict(args),
+        "weights": weights,
+        "task": task,
+        "spaces": {"obs_dim": 18, "low": low, "high": high},
+        "fingerprint": crane_runs.fingerprint(agent, 18),
+    }
+    torch.save(policy, tmp_path / "policy.pt")
     loaded, trained_on, name = eval_crane.load_policy(tmp_path)  # the run's folder or the file
     assert name == script.ALGORITHM and trained_on == task
     obs = torch.randn(3, 5, 18)  # three decisions of five cranes

@@ -557,7 +557,7 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
     ours = {"algorithm": algorithm, "task": task, "args": args}
     (tmp_path / "policy").mkdir()
     torch.save({**ours, "weights": {}, "global_step": 64}, tmp_path / "policy" / "checkpoint.pt")
-    ours |= {"weights": {}, "optimizer": {}, "iteration": 1}
+    ours |= {"weights": {}, "optimizer": {}, "iteration": 1, "fingerprint": torch.zeros(1)}
     for name, change in {
         "other": {"algorithm": "other"},
         "task": {"task": task | {"revision": crane_env.REVISION - 1}},
