@@ -37,7 +37,8 @@ LEVELS = {  # flags of each script on the harder levels
         "mppo_beta_crane": "--total-timesteps 1536000 --learning-rate 4e-4 --num-envs 128 "
         "--minibatch-size 2048",
         "trpo_crane": "--total-timesteps 1536000 --warm-up 0.6 --num-envs 128 "
-        "--minibatch-size 2048 --fisher-samples 2048 --cg-iterations 5",
+        "--minibatch-size 2048 --fisher-samples 2048 --cg-iterations 5 "
+        "--env.retry 0.5",
         "ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4 --num-envs 128 "
         "--minibatch-size 2048",
         "recurrent_ppo_crane": "--total-timesteps 1536000 --num-envs 128 --env.retry 0.5",
@@ -46,7 +47,8 @@ LEVELS = {  # flags of each script on the harder levels
         "mppo_beta_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 "
         "--perturbed 0.2 --num-envs 128 --minibatch-size 2048",
         "trpo_crane": "--total-timesteps 4096000 --warm-up 0.2 --num-envs 128 "
-        "--minibatch-size 2048 --fisher-samples 2048 --cg-iterations 5",
+        "--minibatch-size 2048 --fisher-samples 2048 --cg-iterations 5 "
+        "--env.retry 0.5",
         "ppo_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 --num-envs 128 "
         "--minibatch-size 2048",
         "recurrent_ppo_crane": "--total-timesteps 4096000 --warm-up 0.2 --num-envs 128 "
