@@ -557,7 +557,10 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
     ours = {"algorithm": algorithm, "task": task, "args": args}
     (tmp_path / "policy").mkdir()
     torch.save({**ours, "weights": {}, "global_step": 64}, tmp_path / "policy" / "checkpoint.pt")
-    ours |= {"weights": {}, "optimizer": {}, "iteration": 1, "fingerprint": torch.zeros(1)}
+    ours |= {"weights": {}, "optimizer": {}, "iteration": 1}
+    (tmp_path / "unmarked").mkdir()
+    torch.save(ours, tmp_path / "unmarked" / "checkpoint.pt")
+    ours |= {"fingerprint": torch.zeros(1)}
     for name, change in {
         "other": {"algorithm": "other"},
         "task": {"task": task | {"revision": crane_env.REVISION - 1}},
@@ -575,6 +578,7 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         ("task", f"is of {algorithm}, task revision {crane_env.REVISION - 1}{here}"),
         ("more", "is damaged or not of this script"),
         ("policy", "lacks what a checkpoint has, as a policy.pt does"),
+        ("unmarked", "lacks what a checkpoint has, as a policy.pt does"),
         ("old", "is damaged or not of this script"),
         ("text", "is damaged or not of this script"),
     ]:
