@@ -7,7 +7,7 @@
 The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
 stages). Two passive joints q5, q6 let a rotator q7 hang down with the grapple's two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
-Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` is the task as printed there,
+Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` comes close to the task as printed,
 `ForestryCraneHydraulic-v0` the same crane with drives as measured on the machine, and in
 `ForestryCraneRandomized-v0` each episode draws a machine, a log and sensors with errors.
 Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
@@ -98,7 +98,7 @@ from machine import ACTUATED, COMMAND_OF_SERVO, COSTS, JOINTS, PASSIVE, SERVOS, 
 
 HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
 REVISION = 7  # of the task; raise it when a change makes trained policies worse
-ANTI_WINDUP = 5  # physics steps between two clamps of the servos' integrators, at most
+ANTI_WINDUP = 5  # steps between two clamps of the integrators, at most; as ground_force's nsample
 
 CARE = ["gentle", *COSTS, "time_up", "log_speed"]
 Array = np.ndarray

@@ -268,7 +268,7 @@ class Run:
             self.bar.close()
             if self.rank == 0:
                 say(f"stopped after update {iteration}; go on with --resume {self.dir}")
-            raise SystemExit(128 + [*self.stop_signals, signal.SIGTERM][0])
+            raise SystemExit(128 + (self.stop_signals or [signal.SIGTERM])[0])
         self.bar.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
     def evaluate(self, name: str, trials: int, iteration: int) -> dict[str, float]:

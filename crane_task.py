@@ -86,7 +86,8 @@ def ease_start(
 ) -> tuple[Array, Array, float]:
     """A start of `sample_start` with its log moved towards an easy place, which difficulty 0 has.
 
-    The easy place is a point under the grapple, with the grapple's yaw and the mean diameter.
+    The easy place is under the boom's tip, or as near to it as logs may lie. It has the grapple's
+    yaw and the mean diameter.
     """
     q1, q7, (x, y, yaw) = q[0], q[6], log_pose
     out, _ = tip_position(*q[1:4])

@@ -16,7 +16,7 @@ The rest is PPO (Schulman et al., 2017) with generalized advantage estimation:
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
 V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. The executed action follows the perturbed policy, but
 rho and the KL estimate use the unperturbed Beta. While eps > 0 the estimate is therefore biased.
-Along the run the policy narrows, the horizon grows, the step size falls (docs/mppo_beta.md).
+Difficulty, policy width, horizon and step size follow schedules (docs/mppo_beta.md).
 
     python mppo_beta_crane.py  # the crane: minutes on two cores
     python mppo_beta_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
@@ -319,14 +319,15 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = batch_size / (now - rollout_start)
-        report = {"time/updates": iteration, "schedule/perturbation": epsilon}
+        report = {"time/updates": iteration, "schedule/gamma": gamma}
+        report["schedule/perturbation"] = epsilon
         report |= {name: np.mean(numbers) for name, numbers in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
         unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
         report["losses/explained_variance"] = 1 - unexplained
         at_bounds = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
         report["policy/boundary_frac"] = at_bounds.float().mean().item()
-        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
         report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         run.finish_update(iteration, report)

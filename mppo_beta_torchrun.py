@@ -341,14 +341,15 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = world_size * batch_size / (now - rollout_start)
-        report = {"time/updates": iteration, "schedule/perturbation": epsilon}
+        report = {"time/updates": iteration, "schedule/gamma": gamma}
+        report["schedule/perturbation"] = epsilon
         report |= {name: np.mean(numbers) for name, numbers in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
         unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
         report["losses/explained_variance"] = 1 - unexplained
         at_bounds = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
         report["policy/boundary_frac"] = at_bounds.float().mean().item()
-        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
         report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         stop = average(torch.tensor(float(len(run.stop_signals)), device=device)) > 0

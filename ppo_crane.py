@@ -13,7 +13,7 @@ With generalized advantage estimation:
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
 V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
-Along the run the policy narrows, the horizon grows, the step size falls (docs/ppo.md).
+Difficulty, policy width, horizon and step size follow schedules (docs/ppo.md).
 
     python ppo_crane.py  # the crane: minutes on two cores
     python ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
@@ -301,12 +301,12 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = batch_size / (now - rollout_start)
-        report = {"time/updates": iteration}
+        report = {"time/updates": iteration, "schedule/gamma": gamma}
         report |= {name: np.mean(numbers) for name, numbers in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
         unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
         report["losses/explained_variance"] = 1 - unexplained
-        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
         report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         run.finish_update(iteration, report)

@@ -10,7 +10,7 @@ the grapple swings. A policy with a memory can infer both:
   the state that its crane had when the rollout began.
 
 Advantages A, returns R, the loss and what the time limit does are those of ppo_crane.py.
-Along the run the policy narrows, the horizon grows, the step size falls (docs/recurrent_ppo.md).
+Difficulty, policy width, horizon and step size follow schedules (docs/recurrent_ppo.md).
 
     python recurrent_ppo_crane.py  # the crane: minutes on two cores
     python recurrent_ppo_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9 --log-std-init 0
@@ -338,12 +338,12 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = batch_size / (now - rollout_start)
-        report = {"time/updates": iteration}
+        report = {"time/updates": iteration, "schedule/gamma": gamma}
         report |= {name: np.mean(numbers) for name, numbers in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
         unexplained = (advantages.var() / (returns.var() + 1e-8)).item()
         report["losses/explained_variance"] = 1 - unexplained
-        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
         report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         run.finish_update(iteration, report)

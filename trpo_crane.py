@@ -16,7 +16,7 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
 Advantages A, returns R and what the time limit does are those of ppo_crane.py.
-Along the run the policy narrows, the horizon grows, the critic's step size falls (docs/trpo.md).
+Difficulty, policy width, horizon and the critic's step size follow schedules (docs/trpo.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
     python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
@@ -387,12 +387,12 @@ if __name__ == "__main__":
         # Reports
         now = time.time()
         sps = batch_size / (now - rollout_start)
-        report = {"time/updates": iteration} | step_report
+        report = {"time/updates": iteration, "schedule/gamma": gamma} | step_report
         report |= {name: np.mean(numbers) for name, numbers in stats.items()}
         report |= crane_trials.rollout_report(envs, infos)
         unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
         report["losses/explained_variance"] = 1 - unexplained
-        report |= {"schedule/gamma": gamma, "schedule/learning_rate": left * args.learning_rate}
+        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
         report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
         report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
         run.finish_update(iteration, report)

@@ -42,6 +42,8 @@ fi
 # The scripts take gamma and lambda per 0.1 s and convert them to the length of a decision. The
 # paper trained with Stable-Baselines3, whose defaults are 0.99 and 0.95 per decision. A decision of
 # the paper takes 5 ms, and 0.1 s have 20 of them: 0.99^20 = 0.8179 and 0.95^20 = 0.3585.
+# sb3-contrib takes the mean KL divergence over the six components of the action, we take the sum:
+# its target_kl 0.01 and damping 0.1 are six times as large here.
 flags=(
     --env-id ForestryCranePaper-v0 --env.retry 0
     --total-timesteps 500_000_000 --num-envs 42 --num-steps 1000
@@ -52,7 +54,7 @@ minibatches=(--minibatch-size 2000)
 case $algorithm in
     mppo_beta) flags+=("${minibatches[@]}" --target-kl None --log-excess-init 0) ;;
     ppo) flags+=("${minibatches[@]}" --target-kl None --log-std-init -0.5) ;;
-    trpo) flags+=("${minibatches[@]}" --max-kl 0.01 --fisher-samples 42000 --log-std-init -0.5) ;;
+    trpo) flags+=("${minibatches[@]}" --max-kl 0.06 --cg-damping 0.6 --fisher-samples 42000 --log-std-init -0.5) ;;
     recurrent_ppo) flags+=(--num-minibatches 21 --target-kl None --log-std-init -0.5) ;;
     *)
         echo "no algorithm $algorithm; take mppo_beta, ppo, trpo or recurrent_ppo" >&2
