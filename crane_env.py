@@ -98,7 +98,7 @@ from machine import ACTUATED, COMMAND_OF_SERVO, COSTS, JOINTS, PASSIVE, SERVOS, 
 
 HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
 REVISION = 7  # of the task; raise it when a change makes trained policies worse
-ANTI_WINDUP = 5  # steps between two clamps of the integrators, at most; as ground_force's nsample
+ANTI_WINDUP = 5  # most steps between two clamps of the integrators; crane.xml's nsample equals it
 
 CARE = ["gentle", *COSTS, "time_up", "log_speed"]
 Array = np.ndarray
