@@ -18,6 +18,7 @@ from pathlib import Path
 import make_runs
 import numpy as np
 import plot_curves
+import rivals as rival_runs
 import tyro
 from plot_curves import PAPER, Run, read, recorded
 
@@ -270,6 +271,11 @@ def measured_ratios() -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row["part"] == "ratio"]
 
 
+def rivals() -> str:
+    """rivals.csv: success of the runs of ten minutes."""
+    return rival_runs.results_table(rival_runs.RESULTS, 10.0)
+
+
 def scaling() -> str:
     """scaling.csv: what the model predicts for a network between machines."""
     rows = [row for row in rows_of("scaling.csv") if row["what"] == "model, 10 Gbit/s"]
@@ -292,6 +298,7 @@ TABLES = {
     "ablations": ablations,
     "speed": speed,
     "missed": missed,
+    "rivals": rivals,
     "scaling": scaling,
 }
 

@@ -377,7 +377,8 @@ def run_here(args: Args) -> None:
     except TimeUp:
         pass
     with open(args.results, "a", newline="") as file:  # one write, when all is done
-        csv.writer(file).writerows([name, setting, seed, args.minutes, *row] for row in clock.rows)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([name, setting, seed, args.minutes, *row] for row in clock.rows)
 
 
 def run_all(args: Args) -> None:
@@ -402,6 +403,7 @@ def run_all(args: Args) -> None:
         command = [sys.executable, __file__, "--rivals", name, "--settings", setting]
         extra = {"OMP_NUM_THREADS": str(args.threads), "JAX_PLATFORMS": "cpu"}
         extra["GOMP_SPINCOUNT"] = "5000"  # as our scripts have it
+        extra["CUDA_VISIBLE_DEVICES"] = ""  # skrl would put a part of its networks on a GPU
         with tempfile.TemporaryDirectory() as folder:  # for what they write
             extra[STARTED] = str(time.time())
             words = [*command, "--seeds", str(seed), *common]
