@@ -209,7 +209,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             for name, (nominal, _, _) in machine.DRAWN.items()
             if self.hydraulic or name not in machine.OF_DRIVES
         }
-
         self.valves = machine.Valves(self.num_envs)
         self.costs = machine.Costs(self.num_envs)
         self.time_up = np.full(self.num_envs, np.inf)  # s
@@ -292,7 +291,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if not np.isfinite(actions).all():
             raise ValueError("actions must be finite, got NaN or infinity")
         actions = np.clip(actions, -1, 1)
-        command = np.where(actions < 0, -actions * self.speed[0], actions * self.speed[1])
+        command = actions * machine.speed_limit(actions, self.speed)
         diverged = self.simulate(command)
         self.decisions += 1
 
@@ -369,8 +368,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def count_costs(self, seconds: float) -> None:
         """Add to `costs` what the last piece of a decision took."""
-        ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1)
-        q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
+        sound = ~self.batch.warning[:, :, 1].any(axis=-1)[:, None]  # the engine reset the others
+        ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1) * sound
+        q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED] * sound
         force = self.drive_force[:, SERVOS] @ np.eye(6)[COMMAND_OF_SERVO]  # of both stages, jaws
         self.costs.add(ground, q, dq, force, seconds)
 
@@ -490,12 +490,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
         parts = [q, state.dq, delta_p, angle[:, None]]
         if self.options["sensors"]:
-            limit = np.where(command < 0, -self.speed[0], self.speed[1])
             force = self.servo_kp * (self.act - self.qpos[:, SERVOS])
             force += self.servo_kv * (self.ctrl[:, :8] - self.qvel[:, SERVOS])
             limit_of_force = self.model.jnt_actfrcrange[SERVOS, 1]
-            force = np.clip(force / limit_of_force, -1, 1)[:, [0, 1, 2, 3, 5, 6]]
-            parts += [command / limit, self.qvel[:, JOINTS][:, PASSIVE], force]
+            force = np.clip(force / limit_of_force, -1, 1)[:, machine.FIRST_SERVO]
+            last_command = command / machine.speed_limit(command, self.speed)
+            parts += [last_command, self.qvel[:, JOINTS][:, PASSIVE], force]
         obs = np.concatenate(parts, axis=-1)
         obs[np.isnan(obs)] = 0  # of a crane that diverged
         space = self.single_observation_space

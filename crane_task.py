@@ -43,9 +43,9 @@ NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
 GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
-# What r_ground takes away at GENTLE_FORCE. It begins at half of it and grows linearly.
+# r_ground is 0 up to half of GENTLE_FORCE and falls linearly, to minus this weight at GENTLE_FORCE.
 GROUND_WEIGHT = {"ideal": 30.0, "hydraulic": 90.0}
-# r_ground is at most this many times GROUND_WEIGHT. Stiff servos hit hard or not at all.
+# r_ground never falls below minus this many GROUND_WEIGHTs: stiff servos hit hard or not at all.
 GROUND_MOST = {"ideal": 1.0, "hydraulic": 3.0}
 
 LIMITED = slice(0, 7)  # of our q1 ... q8: the jaws' end stops are part of grasping

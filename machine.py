@@ -1,8 +1,8 @@
 """The machine: the crane's model, and drives as measured on the real one (the jaws' are estimated).
 
-The drives turn oil into motion. A command passes a dead time, the lag of a valve, and a spring. The
-spring's rest position moves at the commanded speed, and its force is limited. Joints are damped.
-The pump's oil is limited.
+The drives turn oil into motion. A command passes the lag of a valve, the pump, a dead time, and a
+spring. The spring's rest position moves at the speed that is left, and its force is limited. Joints
+are damped.
 `crane_env` simulates this with actuators="hydraulic". Sources of all numbers: assets/README.md.
 """
 
@@ -30,6 +30,7 @@ SPEEDS = {  # lowest and highest of (q1, q2, q3, q4, q7, q8): rad/s, per telesco
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]
 SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the engine's joints that a servo moves
 COMMAND_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]
+FIRST_SERVO = [0, 1, 2, 3, 5, 6]  # of each command: the first telescope stage, the outer jaw
 ACTUATED = [0, 1, 2, 3, 6, 7]  # of our q1 ... q8
 PASSIVE = [4, 5]  # of our q1 ... q8
 
@@ -42,7 +43,7 @@ BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes t
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
 PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
-MIN_LEVER = 0.05  # m; below q2 = -1.1 rad the boom's two bars do not reach each other
+MIN_LEVER = 0.05  # m; below q2 = -1.12 rad the boom's computed lever is smaller or negative
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
 # The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
 OIL = np.array(
@@ -128,6 +129,11 @@ def install_drives(spec: mujoco.MjSpec) -> None:
         spring.delay, spring.nsample = DEAD_TIME[command], MAX_DELAY
 
 
+def speed_limit(command: Array, speed: Array) -> Array:
+    """Speed limit, positive, in the direction of each command (N, 6); speed as in SPEEDS."""
+    return np.where(command < 0, -speed[0], speed[1])
+
+
 def cylinder_levers(q2: Array, q3: Array) -> Array:
     """Metres that boom and arm cylinder lengthen per radian of q2 and q3, (2, N).
 
@@ -136,6 +142,7 @@ def cylinder_levers(q2: Array, q3: Array) -> Array:
     """
 
     def boom(q: Array) -> Array:
+        q = np.maximum(q, -1.18)  # lower, the bars do not reach each other
         x, y = 0.4539 * np.cos(q) + 0.036 * np.sin(q) + 0.12, 0.4539 * np.sin(q) - 0.036 * np.cos(q)
         y = y + 0.07  # from the bars' pivot on the column to that on the boom
         apart = np.hypot(x, y)
@@ -188,8 +195,9 @@ class Valves:
         """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
 
         command (n, 6) in rad/s and m/s, q (n, ...) the joints, rad and m. A valve follows its
-        command as a first-order lag. A resting telescope's load-holding valve opens late. If all
-        joints ask for more oil than the pump gives, all get the same share of what they ask for.
+        command as a first-order lag. A resting telescope's load-holding valve opens late. If the
+        joints together ask for more oil than the pump gives, each gets the same share of what it
+        asks for.
         """
         speed, telescope = self.speed[ids], command[:, 3]
         resting = (np.abs(speed[:, 3]) < 1e-3) & (np.abs(telescope) >= 1e-3)
@@ -222,7 +230,7 @@ class Costs:
         ground (N, k) in N at each of the last k physics steps. All else is of the last one:
         q (N, 8), dq (N, 6) and force (N, 6) of the drives, in rad, m, s, N m and N. The pump gives
         every joint its oil, at the pressure that the hardest of those that move needs. At their
-        force limits boom, telescope and jaws need more than the pump's 25 MPa.
+        force limits boom, arm, telescope and jaws can need more than the pump's 25 MPa.
         """
         oil = oil_per_movement(q, dq)
         flow = np.sum(oil * np.abs(dq), axis=-1)

@@ -745,6 +745,8 @@ def test_divergence_is_reported_and_recovered(tmp_path, monkeypatch):
     assert terminated.tolist() == [False, True, False] and reward[1] == 0
     assert np.isfinite(obs).all() and np.isfinite(info["final_obs"][1]).all()
     assert all(np.isfinite(info[term]).all() for term in crane_task.TERMS)  # reports take the mean
+    # the engine puts the crane into its zero position, in the ground: that is no hit and no work
+    assert info["ground_peak"][1] == info["r_ground"][1] == info["work"][1] == 0
     _, _, terminated, _, info = envs.step(np.zeros((3, 6)))
     assert not terminated.any() and set(info["termination"]) == {"none"}
     state = envs.state()
