@@ -12,10 +12,12 @@ The rest is PPO (Schulman et al., 2017) with generalized advantage estimation:
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)         A_t = delta_t + gamma lambda A_{t+1}
     rho     = pi(a | s) / pi_old(a | s)               R   = A + V_old
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
+    KL      = E[rho - 1 - log rho]                    stops the epochs (Schulman, 2020)
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
-V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. The executed action follows the perturbed policy, but
-rho and the KL estimate use the unperturbed Beta. While eps > 0 the estimate is therefore biased.
+V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. In L, A has mean 0 and deviation 1 in each minibatch.
+The executed action follows the perturbed policy, but rho and KL use the unperturbed Beta. So the
+policy gradient and KL are biased while eps > 0.
 Difficulty, policy width, horizon and step size follow schedules (docs/mppo_beta.md).
 
     python mppo_beta_crane.py  # the crane: minutes on two cores
@@ -73,7 +75,7 @@ class Args:
     normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: Factor = 1e-3  # Adam's step size at the start
     gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
+    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: Count = 1024  # decisions per gradient step
@@ -86,7 +88,7 @@ class Args:
     perturbation: Share = 0.1  # eps at the start, half width of the perturbation of a_n
     perturbed: Annotated[float, Range(0.01, 1)] = 0.4  # share of the run in which eps falls to 0
     log_excess_init: Exponent = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
-    narrowing: Exponent = 2.5  # total rise of the actor's outputs along the run, before the bound
+    narrowing: Exponent = 2.5  # rise of the actor's outputs by schedule, before the bound
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
@@ -212,8 +214,8 @@ if __name__ == "__main__":
         raise SystemExit(f"{args.env_id} has unbounded actions, and a Beta needs bounds")
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
 
     # Agent
     torch.manual_seed(args.seed)
@@ -225,8 +227,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        done = iteration / run.num_iterations
-        share = done / args.warm_up if done < args.warm_up else 1.0
+        so_far = iteration / run.num_iterations
+        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 
@@ -234,7 +236,7 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)
+    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
     next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
     for iteration in run.iterations():
         # Schedules
@@ -314,7 +316,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.actor[-1].bias += narrowing  # by schedule, not by gradient
+            agent.actor[-1].bias += narrowing  # by schedule; the gradient moves it as well
 
         # Reports
         now = time.time()

@@ -3,7 +3,8 @@
 This is mppo_beta_crane.py, except that each rank has a share of the cranes and of each minibatch:
 --num-envs and --minibatch-size count those of all ranks. The ranks average their gradients, the KL
 divergence that stops an update, and the statistics of advantages and observations. So all have the
-same weights. Rank 0 evaluates, and writes what it has seen.
+same weights. The observation normalizer changes after each rollout and not in it, so the first
+rollout has raw observations. Rank 0 evaluates, and writes what it has seen.
 Several machines, and what to expect of 8, 64 and 512 cores: docs/speed.md.
 
     torchrun --standalone --nproc-per-node 2 mppo_beta_torchrun.py
@@ -62,7 +63,7 @@ class Args:
     normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: Factor = 1e-3  # Adam's step size at the start
     gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
+    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: Count = 1024  # decisions per gradient step
@@ -75,7 +76,7 @@ class Args:
     perturbation: Share = 0.1  # eps at the start, half width of the perturbation of a_n
     perturbed: Annotated[float, Range(0.01, 1)] = 0.4  # share of the run in which eps falls to 0
     log_excess_init: Exponent = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
-    narrowing: Exponent = 2.5  # total rise of the actor's outputs along the run, before the bound
+    narrowing: Exponent = 2.5  # rise of the actor's outputs by schedule, before the bound
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
@@ -224,8 +225,8 @@ if __name__ == "__main__":
         raise SystemExit(f"{args.env_id} has unbounded actions, and a Beta needs bounds")
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
 
     # Agent
     torch.manual_seed(args.seed)
@@ -242,8 +243,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        done = iteration / run.num_iterations
-        share = done / args.warm_up if done < args.warm_up else 1.0
+        so_far = iteration / run.num_iterations
+        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 
@@ -251,7 +252,7 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)
+    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
     next_obs = to_tensor(envs.reset(seed=seeds)[0])
     for iteration in run.iterations():
         # Schedules
@@ -336,7 +337,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and mean_kl > args.target_kl:
                 break
         with torch.no_grad():
-            agent.actor[-1].bias += narrowing  # by schedule, not by gradient
+            agent.actor[-1].bias += narrowing  # by schedule; the gradient moves it as well
 
         # Reports
         now = time.time()

@@ -1,24 +1,22 @@
-r"""PPO: proximal policy optimization with a Gaussian policy, on the crane.
+"""PPO: proximal policy optimization with a Gaussian policy, on the crane.
 
 The paper's first baseline (Vu et al., Sec. V-A), after Schulman et al., 2017:
 
-The policy is a ~ N(mu(s), sigma^2), with one sigma for all states. An action is clipped to the
-environment's limits only when it is executed. An evaluation takes the mean mu(s).
-
-With generalized advantage estimation:
+- The policy is a ~ N(mu(s), sigma^2), with one sigma per action for all states. An action is
+  clipped to the environment's limits only when it is executed. An evaluation takes the mean mu(s).
+- The update makes many gradient steps on each rollout, with generalized advantage estimation:
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)         A_t = delta_t + gamma lambda A_{t+1}
     rho     = pi(a | s) / pi_old(a | s)               R   = A + V_old
     L       = -E[min(rho A, clip(rho, 1 - c, 1 + c) A)] + c_v E[(V - R)^2] - c_e E[H]
+    KL      = E[rho - 1 - log rho]                    stops the epochs (Schulman, 2020)
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
-V(s_{t+1}) is V(final_obs) and A_{t+1} is 0.
+V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. In L, A has mean 0 and deviation 1 in each minibatch.
 Difficulty, policy width, horizon and step size follow schedules (docs/ppo.md).
 
     python ppo_crane.py  # the crane: minutes on two cores
     python ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
-    python ppo_crane.py --env-id Pendulum-v1 --num-envs 8 --minibatch-size 64 --gamma 0.9 \
-        --log-std-init 0.5
 """
 
 import os
@@ -70,7 +68,7 @@ class Args:
     normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: Factor = 7e-4  # Adam's step size at the start
     gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
+    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: Count = 1024  # decisions per gradient step
@@ -81,7 +79,7 @@ class Args:
     vf_coef: Factor = 0.5  # c_v, weight of the value loss
     max_grad_norm: Factor = 0.5  # bound of the gradient's norm
     log_std_init: Exponent = -1.2  # log sigma at the start [action units]
-    narrowing: Exponent = 1.25  # total fall of log sigma along the run
+    narrowing: Exponent = 1.25  # fall of log sigma by schedule; the gradient moves it as well
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
@@ -198,8 +196,8 @@ if __name__ == "__main__":
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
 
     # Agent
     torch.manual_seed(args.seed)
@@ -211,8 +209,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        done = iteration / run.num_iterations
-        share = done / args.warm_up if done < args.warm_up else 1.0
+        so_far = iteration / run.num_iterations
+        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 
@@ -220,11 +218,12 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)
+    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
     next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
     for iteration in run.iterations():
         # Schedules
-        left = 1.0 - (iteration - 1.0) / run.num_iterations
+        progress = (iteration - 1.0) / run.num_iterations
+        left = 1.0 - progress
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
@@ -296,7 +295,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.log_std -= narrowing  # by schedule, not by gradient
+            agent.log_std -= narrowing  # by schedule; the gradient moves it as well
 
         # Reports
         now = time.time()

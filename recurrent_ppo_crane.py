@@ -68,7 +68,7 @@ class Args:
     normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: Factor = 7e-4  # Adam's step size at the start
     gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
+    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     num_minibatches: Size = 4  # groups of cranes; one gradient step on the rollouts of each
@@ -79,7 +79,7 @@ class Args:
     vf_coef: Factor = 0.5  # c_v, weight of the value loss
     max_grad_norm: Factor = 0.5  # bound of the gradient's norm
     log_std_init: Exponent = -1.2  # log sigma at the start [action units]
-    narrowing: Exponent = 1.25  # total fall of log sigma along the run
+    narrowing: Exponent = 1.25  # fall of log sigma by schedule; the gradient moves it as well
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
@@ -222,8 +222,8 @@ if __name__ == "__main__":
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
 
     # Agent
     torch.manual_seed(args.seed)
@@ -235,8 +235,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        done = iteration / run.num_iterations
-        share = done / args.warm_up if done < args.warm_up else 1.0
+        so_far = iteration / run.num_iterations
+        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 
@@ -244,13 +244,14 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones, starts = torch.zeros((3, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)
+    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
     next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
     next_start = torch.ones(args.num_envs, device=device)
     state = agent.initial_state(args.num_envs)
     for iteration in run.iterations():
         # Schedules
-        left = 1.0 - (iteration - 1.0) / run.num_iterations
+        progress = (iteration - 1.0) / run.num_iterations
+        left = 1.0 - progress
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
@@ -333,7 +334,7 @@ if __name__ == "__main__":
             if args.target_kl is not None and np.mean(epoch_kls) > args.target_kl:
                 break
         with torch.no_grad():
-            agent.log_std -= narrowing  # by schedule, not by gradient
+            agent.log_std -= narrowing  # by schedule; the gradient moves it as well
 
         # Reports
         now = time.time()

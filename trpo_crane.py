@@ -6,16 +6,16 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 - Each rollout allows one step s of the policy. It goes along the natural gradient, so far that the
   mean KL divergence from the old policy stays within delta.
 
-    max g^T s   subject to   1/2 s^T F s <= delta         g = grad E[rho A]
-    s = sqrt(2 delta / x^T F x) x,   F x = g              F = H + d I
+    max g^T s   subject to   1/2 s^T (F + d I) s <= delta         g = grad E[rho A]
+    s = sqrt(2 delta / x^T (F + d I) x) x,   (F + d I) x = g
 
-  H is the Hessian of the mean KL divergence at the old policy. Conjugate gradient solves F x = g on
-  a sample of the rollout with products F v, without ever forming F (Schulman et al., App. C.1).
+  F is the Hessian of the mean KL divergence at the old policy. A few iterations of conjugate
+  gradient solve for x roughly, with products F v and without F itself (Schulman et al., App. C.1).
 - A line search over the whole rollout takes the first of s, c s, c^2 s, ... with KL <= delta and a
   larger E[rho A]. If none qualifies, the policy stays.
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
-Advantages A, returns R and what the time limit does are those of ppo_crane.py.
+Advantages A, returns R and the time limit are as in ppo_crane.py. A is scaled over the rollout.
 Difficulty, policy width, horizon and the critic's step size follow schedules (docs/trpo.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
@@ -26,7 +26,6 @@ import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -73,7 +72,7 @@ class Args:
     normalize_obs: bool = True  # scale observations by their running mean and deviation
     learning_rate: Factor = 1e-3  # Adam's step size at the start, for the critic
     gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # of 1 / (1 - gamma) along the run
+    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
     reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
     minibatch_size: Count = 1024  # decisions per gradient step of the critic
@@ -81,12 +80,12 @@ class Args:
     max_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
     cg_iterations: Times = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
-    fisher_samples: Count = 1024  # decisions of each rollout on which F x = g is solved
-    line_search_steps: Times = 10  # most trials of the line search
-    line_search_decay: Annotated[float, Range(0.01, 0.99)] = 0.8  # c, from one trial to the next
+    fisher_samples: Count = 1024  # decisions of each rollout that F is taken from
+    line_search_steps: Times = 10  # largest number of trials of the line search
+    line_search_decay: Annotated[float, Range(0.01, 0.99)] = 0.8  # c, factor from trial to trial
     max_grad_norm: Factor = 0.5  # bound of the norm of the critic's gradient
     log_std_init: Exponent = -1.2  # log sigma at the start [action units]
-    narrowing: Exponent = 0.3  # total fall of log sigma along the run
+    narrowing: Exponent = 0.3  # fall of log sigma by schedule; the gradient moves it as well
 
     # evaluation
     eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
@@ -176,9 +175,9 @@ def flat(tensors: Iterable[Tensor]) -> Tensor:
 
 
 def fisher_product(agent: Agent, obs: Tensor, damping: float) -> Callable[[Tensor], Tensor]:
-    """The function v -> (H + damping I) v, v like the flat `policy_parameters`.
+    """The function v -> (F + damping I) v, v like the flat `policy_parameters`.
 
-    H = E[J^T J / sigma^2] for the weights of mu, with J = d mu / d weights, and 2 for each log
+    F = E[J^T J / sigma^2] for the weights of mu, with J = d mu / d weights, and 2 for each log
     sigma. Second derivatives of mu drop out because d KL / d mu is 0 at the old policy.
     """
     mean, weights = agent.actor(obs), list(agent.actor.parameters())
@@ -229,18 +228,17 @@ def line_search(
     """Move the policy along full_step. Returns the accepted fraction, the KL and the improvement.
 
     batch: obs, actions, advantages and old policy, as `surrogate_and_kl` takes them. If no fraction
-    is accepted, the parameters stay untouched and all three are 0.
+    is accepted, the policy stays as it was and all three are 0.
     """
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
     start = flat(agent.policy_parameters())
-    trial = deepcopy(agent)
     for k in range(args.line_search_steps):
         fraction = args.line_search_decay**k
-        nn.utils.vector_to_parameters(start + fraction * full_step, trial.policy_parameters())
-        surrogate, kl = surrogate_and_kl(trial, *batch)
+        nn.utils.vector_to_parameters(start + fraction * full_step, agent.policy_parameters())
+        surrogate, kl = surrogate_and_kl(agent, *batch)
         if kl <= args.max_kl and surrogate > old_surrogate:
-            agent.load_state_dict(trial.state_dict())
             return fraction, kl.item(), (surrogate - old_surrogate).item()
+    nn.utils.vector_to_parameters(start, agent.policy_parameters())
     return 0.0, 0.0, 0.0
 
 
@@ -280,8 +278,8 @@ if __name__ == "__main__":
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
     full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # in a decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # in a decision; 20 steps take 0.1 s
+    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
+    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
 
     # Agent
     torch.manual_seed(args.seed)
@@ -294,8 +292,8 @@ if __name__ == "__main__":
 
     def set_difficulty(iteration: int) -> None:
         """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        done = iteration / run.num_iterations
-        share = done / args.warm_up if done < args.warm_up else 1.0
+        so_far = iteration / run.num_iterations
+        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
         if is_crane:
             envs.unwrapped.difficulty = full_difficulty * share
 
@@ -303,11 +301,12 @@ if __name__ == "__main__":
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)
+    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
     next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
     for iteration in run.iterations():
         # Schedules
-        left = 1.0 - (iteration - 1.0) / run.num_iterations
+        progress = (iteration - 1.0) / run.num_iterations
+        left = 1.0 - progress
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = (1 - (1 - args.gamma) / growth) ** tenths
@@ -351,7 +350,7 @@ if __name__ == "__main__":
         batch = (b_obs, b_actions, adv, old)
         surrogate, _ = surrogate_and_kl(agent, *batch)
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-        # A sample of the rollout gives the direction. The whole rollout gives the length.
+        # F of a sample is cheaper and gives a good direction. With its length KL exceeds delta.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
         matvec = fisher_product(agent, b_obs[sample], args.cg_damping)
         direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
@@ -382,7 +381,7 @@ if __name__ == "__main__":
                 stats["losses/value_loss"].append(value_loss.item())
                 stats["losses/grad_norm"].append(grad_norm.item())
         with torch.no_grad():
-            agent.log_std -= narrowing  # by schedule, not by gradient
+            agent.log_std -= narrowing  # by schedule; the gradient moves it as well
 
         # Reports
         now = time.time()

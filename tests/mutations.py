@@ -95,8 +95,8 @@ MUTATIONS = [
     Mutation(
         "V(final_obs) without memory",
         ("recurrent_ppo_crane.py",),
-        "cut_state = torch.zeros_like(final_obs[..., 0]), [h[cut] for h in state]",
-        "cut_state = torch.zeros_like(final_obs[..., 0]), agent.initial_state(int(cut.sum()))",
+        "cut_state = [part[cut] for part in state]",
+        "cut_state = agent.initial_state(int(cut.sum()))",
         "test_scripts -k follows",
     ),
     Mutation(
@@ -123,8 +123,8 @@ MUTATIONS = [
     Mutation(
         "the warm-up never ends",
         SCRIPTS,
-        "share = progress / args.warm_up if progress < args.warm_up else 1.0",
-        "share = progress",
+        "share = so_far / args.warm_up if so_far < args.warm_up else 1.0",
+        "share = so_far",
         "test_scripts -k warm_up",
     ),
     Mutation(

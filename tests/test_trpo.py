@@ -117,25 +117,6 @@ def test_line_search_restores_exactly_on_failure(failure):
     assert all(torch.equal(a, b) for a, b in zip(before, agent.policy_parameters()))
 
 
-def test_interrupted_line_search_restores_exactly(monkeypatch):
-    agent = make_agent()
-    batch, before = make_batch(agent), [p.clone() for p in agent.policy_parameters()]
-    step, calls = 50 * ascent(agent, batch), []
-    surrogate_and_kl = trpo_crane.surrogate_and_kl
-
-    def interrupted(trial, *batch):
-        calls.append(flat(p.detach() for p in trial.policy_parameters()))
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return surrogate_and_kl(trial, *batch)
-
-    monkeypatch.setattr(trpo_crane, "surrogate_and_kl", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        line_search(agent, step, batch, Args(max_kl=1e-6))
-    assert not torch.equal(calls[0], calls[2])  # it came in the middle of a trial
-    assert all(torch.equal(a, b) for a, b in zip(before, agent.policy_parameters()))
-
-
 def test_natural_step_spends_the_divergence_it_is_given():
     """For a small delta the quadratic model holds: KL(s) is delta, the gain g^T s."""
     agent = make_agent()
