@@ -214,13 +214,13 @@ class OnnxPolicy:
 
 
 class FixedPolicy:
-    """Zero or uniformly random actions."""
+    """Zero or uniformly random actions, from torch's generator, which each table seeds anew."""
 
-    def __init__(self, kind: str, seed: int):
-        self.scale, self.rng = float(kind == "random"), np.random.default_rng(seed)
+    def __init__(self, kind: str):
+        self.scale = float(kind == "random")
 
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True):
-        return self.scale * self.rng.uniform(-1, 1, (len(obs), 6)), None
+        return self.scale * (2 * torch.rand(len(obs), 6).numpy() - 1), None
 
 
 class OwnPolicy:
@@ -285,8 +285,8 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     if args.policy == "scripted":
         options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}
     elif args.env_id and "sensors" in trained_on:
-        envs = make_envs(env_id, 1, **options)
-        for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed"):
+        envs = make_envs(env_id, 1)
+        for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed", "sensors"):
             ours, theirs = envs.unwrapped.options[name], trained_on[name]
             if ours != theirs:
                 print(f"the policy knows {name}={theirs!r}; {env_id} has {ours!r}", file=sys.stderr)
@@ -466,19 +466,25 @@ def main() -> None:
     elif ":" in args.policy:
         policy, name, source = OwnPolicy(args.policy), "mine", args.policy
     else:
-        policy = FixedPolicy(args.policy, args.seed)
+        policy = FixedPolicy(args.policy)
         name = source = args.policy
     env_id, options = task_of(args, task)
     crane = make_envs(env_id, 1, **options).unwrapped
-    all_options = crane.options
-    contact = all_options["contact"]
+    contact, registered = crane.options["contact"], make_envs(env_id, 1).unwrapped.options
+    # the title has two of these, the others change no trial
+    unimportant = {"contact", "difficulty", "pose_noise", "retry", "reward"}
+    changed = {
+        name: value
+        for name, value in crane.options.items()
+        if value != registered[name] and name not in unimportant
+    }
     observed, wanted = crane.single_observation_space, getattr(policy, "observation_space", None)
     if wanted is not None and wanted.shape != observed.shape:  # of Stable-Baselines3
         raise SystemExit(f"{source} observes {wanted.shape}; {env_id} gives {observed.shape}")
     if args.policy == "scripted":
         if crane.dt != DT:
             raise SystemExit(f"the scripted crane decides every {DT} s, not every {crane.dt} s")
-        settings = HYDRAULIC if all_options["actuators"] == "hydraulic" else IDEAL
+        settings = HYDRAULIC if crane.options["actuators"] == "hydraulic" else IDEAL
         policy = ScriptedCrane(args.signed_yaw, settings)
     torch.set_num_threads(1)  # the batches are too small for more
     if args.video or args.viewer:
@@ -503,15 +509,16 @@ def main() -> None:
             mean = sum(cell["successes"] for cell in cells) / len(records)
             answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
             answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
+            answer |= {"changed": changed, "revision": crane_env.REVISION}
             answer["mean_gentle_rate"] = sum(r["gentle"] for r in records) / len(records)
             costs = mean_costs(records)  # JSON has no NaN
             answer["costs"] = {name: None if np.isnan(x) else x for name, x in costs.items()}
             print(json.dumps(answer), flush=True)
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
+            what += "".join(f", {option}={value!r}" for option, value in changed.items())
             papers_task = env_id.split(":")[-1] in ("ForestryCrane-v0", "ForestryCranePaper-v0")
-            # its options may come from the policy's own training
-            papers_task &= (all_options["actuators"], all_options["randomize"]) == ("ideal", 0)
+            papers_task &= not changed
             paper = PAPER.get(noise, {}) if papers_task else {}
             title = TITLES[noise] if papers_task else "Trials"
             print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")

@@ -68,28 +68,47 @@ def score(policy: str, level: str) -> dict[str, float]:
         if ran.returncode:
             raise SystemExit(f"{policy} could not be judged")  # eval_crane.py has said why
         answer = json.loads(ran.stdout.splitlines()[-1])
+        if answer["changed"] and not own:
+            raise SystemExit(f"{policy} needs {answer['changed']}, which {level} does not have")
         scores[f"success_{name}"] = round(100 * answer["mean_success_rate"], 1)
         scores[f"gentle_{name}"] = round(100 * answer["mean_gentle_rate"], 1)
     return scores
 
 
 def check(rows: list[dict[str, str]], method: str) -> list[str]:
-    """One line for each score that does not come again."""
+    """One line, also printed at once, for each score that does not come again."""
     wrong = []
     chosen = [row for row in rows if method in ("", row["method"])]
     if not chosen:
         raise SystemExit(f"the leaderboard has no method {method!r}")
     for row in tqdm(chosen, unit="row"):
-        for name, now in score(row["policy"], row["level"]).items():
+        lines, of = [], f"{row['method']} on {row['level']}"
+        if row["revision"] != str(crane_env.REVISION):
+            lines.append(f"{of}: revision {row['revision']}, the task has {crane_env.REVISION}")
+        try:
+            scores = score(row["policy"], row["level"])
+        except SystemExit as error:
+            scores = {}
+            lines.append(f"{of}: {error}")
+        for name, now in scores.items():
             if round(abs(now - float(row[name])), 1) > TOLERANCE:
-                of = f"{row['method']} on {row['level']}"
-                wrong.append(f"{of}: {name} is {now} %, the row says {row[name]} %")
+                lines.append(f"{of}: {name} is {now} %, the row says {row[name]} %")
+        for line in lines:
+            tqdm.write(line)
+        wrong += lines
     return wrong
+
+
+def read_rows(board: Path) -> list[dict[str, str]]:
+    if not board.is_file():
+        return []
+    with board.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
-    rows = list(csv.DictReader(args.board.open())) if args.board.is_file() else []
+    rows = read_rows(args.board)
     if args.what == "check" and not rows:
         raise SystemExit(f"{args.board} has no rows")
     if rows and (missing := {*COLUMNS, *SCORES} - rows[0].keys()):
@@ -100,11 +119,12 @@ def main() -> None:
         raise SystemExit(f"no folder {args.board.parent}; make it first")
     if args.what == "check":
         wrong = check(rows, args.method)
-        raise SystemExit("\n".join(wrong) or 0)
+        raise SystemExit(f"{len(wrong)} differences" if wrong else 0)
     if not (args.method and args.level and args.policy):
         raise SystemExit("add needs --method, --level and --policy")
     new = {name: getattr(args, name) for name in COLUMNS[:-1]} | {"revision": crane_env.REVISION}
     new |= score(args.policy, args.level)
+    rows = read_rows(args.board)  # again: judging takes minutes, and another row may have come
     same = [row for row in rows if (row["method"], row["level"]) == (args.method, args.level)]
     if same:
         print(f"replaced: {same[0]}")

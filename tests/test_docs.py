@@ -164,8 +164,45 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="no method 'yours'"):
         call("check", "--method", "yours")
     board.write_text(board.read_text().replace("93.5", "95.0"))
-    with pytest.raises(SystemExit, match="gentle_exact is 93.5 %, the row says 95.0 %"):
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match="2 differences"):
         call("check")
+    assert "gentle_exact is 93.5 %, the row says 95.0 %" in capsys.readouterr().out
+
+
+def test_leaderboard_goes_on_after_a_row_that_fails(tmp_path, monkeypatch, capsys):
+    def score(policy: str, level: str) -> dict[str, float]:
+        if policy == "gone.zip":
+            raise SystemExit("gone.zip could not be judged")
+        if policy == "slow.zip":  # somebody adds a row meanwhile
+            others.append(dict(others[0], method="quick"))
+            write()
+        return dict(SCORES)
+
+    def write():
+        with board.open("w", newline="") as file:
+            writer = csv.DictWriter(file, others[0])
+            writer.writeheader()
+            writer.writerows(others)
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["leaderboard.py", *words, "--board", str(board)])
+        leaderboard.main()
+
+    monkeypatch.setattr(leaderboard, "score", score)
+    board = tmp_path / "board.csv"
+    row = dict.fromkeys([*leaderboard.COLUMNS, *leaderboard.SCORES], "")
+    row |= {"method": "mine", "level": "ideal", "policy": "gone.zip", "revision": "1"}
+    others = [row | {name: str(number) for name, number in SCORES.items()}]
+    write()
+    call("add", "--method", "slow", "--policy", "slow.zip", "--level", "ideal")
+    methods = [row["method"] for row in csv.DictReader(board.open())]
+    assert methods == ["mine", "quick", "slow"]
+    with pytest.raises(SystemExit, match="4 differences"):
+        call("check")
+    said = capsys.readouterr().out
+    assert "mine on ideal: gone.zip could not be judged" in said
+    assert "quick on ideal: revision 1, the task has" in said
 
 
 SCORES = {
@@ -174,6 +211,14 @@ SCORES = {
     "success_pose_errors": 96.0,
     "gentle_pose_errors": 92.0,
 }
+
+
+def test_leaderboard_takes_no_policy_that_sees_more(monkeypatch):
+    answer = '{"changed": {"sensors": true}, "mean_success_rate": 1, "mean_gentle_rate": 1}'
+    judged = subprocess.CompletedProcess([], 0, stdout=answer)
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: judged)
+    with pytest.raises(SystemExit, match="needs {'sensors': True}, which ideal does not have"):
+        leaderboard.score("policy.pt", "ideal")
 
 
 @pytest.mark.slow

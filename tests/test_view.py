@@ -115,7 +115,7 @@ def look(monkeypatch, plan, holds=None):
 
     monkeypatch.setattr(FakeWindow, "__init__", remember)
     args = eval_crane.Args(policy="zero", diameters=(0.4, 0.5))
-    zero = eval_crane.FixedPolicy("zero", 0)
+    zero = eval_crane.FixedPolicy("zero")
     crane_view.show(zero, "zero", "ForestryCrane-v0", {}, args)
     return windows[0], slept
 
