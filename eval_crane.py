@@ -19,7 +19,9 @@ import os
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
@@ -91,7 +93,7 @@ class Args:
     env_threads: Threads = 0
     """physics threads, 0 for all cores"""
     csv: Path | None = None
-    """write one row a trial to this file; docs/compare.md has its columns and units"""
+    """write one row a trial to this file, also after Ctrl-C; docs/compare.md has its columns"""
     json: bool = False
     """print one JSON object and nothing else: one table, without pose errors unless asked for.
     Its rates are shares in [0, 1]"""
@@ -185,8 +187,12 @@ def load_sb3(path: Path) -> Any:
         options |= data["policy_kwargs"]
         policy = data["policy_class"](*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights["policy"])
+        scaled = data.get("_last_original_obs") is not None
     except Exception as error:  # a missing library, a damaged file, a model of another version
         raise SystemExit(f"{path}: {error}") from None
+    if scaled:
+        lack = "was trained with VecNormalize, whose statistics are not in the .zip"
+        print(f"{path} {lack}; see docs/compare.md, recipe 4", file=sys.stderr)
     policy.set_training_mode(False)
     return policy
 
@@ -199,10 +205,13 @@ class OnnxPolicy:
             import onnxruntime
 
             self.session = onnxruntime.InferenceSession(path)
-            known = self.session.get_modelmeta().custom_metadata_map
-            self.task, self.algorithm = json.loads(known["task"]), known["algorithm"]
-        except Exception as error:
-            raise SystemExit(f"{path} is no file of export_onnx.py: {error}") from None
+        except Exception as error:  # a missing library, a damaged file
+            raise SystemExit(f"{path}: {error}") from None
+        known = self.session.get_modelmeta().custom_metadata_map
+        if not known.keys() >= {"task", "algorithm"}:
+            mend = "wrap it in a class of your own for --policy my_module:MyPolicy"
+            raise SystemExit(f"{path} is not of export_onnx.py and names no task; {mend}")
+        self.task, self.algorithm = json.loads(known["task"]), known["algorithm"]
         self.memory = self.session.get_inputs()[1:]
 
     def predict(self, obs: np.ndarray, state: list | None, deterministic: bool = True):
@@ -294,10 +303,11 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     return env_id, options
 
 
-def judge(policy: Any, env_id: str, options: dict, args: Args) -> list[dict]:
-    """One record a trial: diameter, success, failure, time_to_reach (s), centre_miss (m), CARE."""
+def judge(policy: Any, env_id: str, options: dict, args: Args) -> Iterator[dict]:
+    """One record a trial: number, diameter, success, failure, time_to_reach (s), centre_miss (m),
+    CARE.
+    """
     diameters, seeds = monte_carlo_trials(args.seed, args.trials, args.diameters)
-    records = []
     with tqdm(total=len(seeds), unit="trial", leave=False) as bar:
         for start in range(0, len(seeds), CRANES):
             chunk = slice(start, start + CRANES)
@@ -307,9 +317,9 @@ def judge(policy: Any, env_id: str, options: dict, args: Args) -> list[dict]:
             envs.close()
             for i, diameter in enumerate(sizes):
                 end = {name: values[i].item() for name, values in results.items()}
-                records.append({"diameter": float(diameter), **trial_record(end)})
+                trial = {"diameter": float(diameter), "trial": (start + i) % args.trials}
+                yield trial | trial_record(end)
             bar.update(len(sizes))
-    return records
 
 
 def trial_record(end: dict) -> dict:
@@ -334,7 +344,7 @@ def summarize(records: list[dict]) -> list[dict]:
     cells = []
     for d in sorted({r["diameter"] for r in records}):
         trials = [r for r in records if r["diameter"] == d]
-        successes = sum(r["success"] for r in trials)
+        successes, gentle = (sum(r[score] for r in trials) for score in ("success", "gentle"))
         cells.append(
             {
                 "diameter": d,
@@ -342,7 +352,8 @@ def summarize(records: list[dict]) -> list[dict]:
                 "successes": successes,
                 "success_rate": successes / len(trials),
                 "interval": wilson_interval(successes, len(trials)),
-                "gentle_rate": sum(r["gentle"] for r in trials) / len(trials),
+                "gentle_rate": gentle / len(trials),
+                "gentle_interval": wilson_interval(gentle, len(trials)),
                 "failures": dict(Counter(r["failure"] for r in trials if not r["success"])),
             }
         )
@@ -391,11 +402,13 @@ def mean_costs(trials: list[dict]) -> dict[str, float]:
 def print_care(records: list[dict], cells: list[dict]) -> None:
     """What the trials cost, one row a diameter and one for all."""
     heads = [head for head, *_ in CARE_COLUMNS]
-    print(f"\n| d [m] | gentle % | {' | '.join(heads)} |")
-    print(f"|-------|----------|{'|'.join('-' * (len(head) + 2) for head in heads)}|")
+    print(f"\n| d [m] | gentle % | 95 % interval | {' | '.join(heads)} |")
+    print(f"|-------|----------|---------------|{'|'.join('-' * (len(h) + 2) for h in heads)}|")
     rows = [([r for r in records if r["diameter"] == c["diameter"]], c["diameter"]) for c in cells]
     for trials, name in [*rows, (records, "all")]:
-        line = [f"{name:<5}", f"{100 * np.mean([r['gentle'] for r in trials]):<8.1f}"]
+        gentle = sum(r["gentle"] for r in trials)
+        low, high = (100 * bound for bound in wilson_interval(gentle, len(trials)))
+        line = [f"{name:<5}", f"{100 * gentle / len(trials):<8.1f}", f"{low:5.1f} - {high:5.1f}"]
         for head, cost in mean_costs(trials).items():
             number = "" if np.isnan(cost) else f"{cost:.2f}"
             line.append(f"{number:<{len(head)}}")
@@ -405,6 +418,27 @@ def print_care(records: list[dict], cells: list[dict]) -> None:
     print("safely up. Log is the log's speed at the end. Gentle and > 20 kN are means over all")
     print("trials. Peak and impulse are medians over all trials. All others are medians over the")
     print("successes.")
+
+
+def print_json(records: list[dict], cells: list[dict], where: dict) -> None:
+    """One object: where it was judged, what judged it, the cells, their means and costs."""
+    answer = where | {"trials": len(records), "cells": cells}
+    for score in ("success", "gentle"):
+        count = sum(r[score] for r in records)
+        answer[f"mean_{score}_rate"] = count / len(records)
+        answer[f"mean_{score}_interval"] = wilson_interval(count, len(records))
+    costs = mean_costs(records)  # JSON has no NaN
+    answer["costs"] = {name: None if np.isnan(x) else x for name, x in costs.items()}
+    answer["revision"] = crane_env.REVISION
+    answer["versions"] = {name: version(name) for name in ("mujoco", "numpy", "torch")}
+    print(json.dumps(answer), flush=True)
+
+
+def write_csv(path: Path, records: list[dict]) -> None:
+    with whole_file(path) as whole, open(whole, "w", newline="") as file:
+        writer = csv.DictWriter(file, records[0].keys())
+        writer.writeheader()
+        writer.writerows(records)
 
 
 def check_combinations(args: Args) -> None:
@@ -497,23 +531,18 @@ def main() -> None:
     for noise in noises:
         torch.manual_seed(args.seed)
         options["pose_noise"] = noise
-        records = judge(policy, env_id, options, args)
+        records = []
+        try:
+            for record in judge(policy, env_id, options, args):
+                records.append(record)
+        finally:  # Ctrl-C keeps what is judged
+            all_records += [{"pose_noise": noise, "seed": args.seed, **r} for r in records]
+            if args.csv and all_records:
+                write_csv(args.csv, all_records)
         cells = summarize(records)
-        all_records += [{"pose_noise": noise, **record} for record in records]
-        if args.csv:
-            with whole_file(args.csv) as path, open(path, "w", newline="") as file:
-                writer = csv.DictWriter(file, all_records[0].keys())
-                writer.writeheader()
-                writer.writerows(all_records)
         if args.json:
-            mean = sum(cell["successes"] for cell in cells) / len(records)
-            answer = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
-            answer |= {"seed": args.seed, "cells": cells, "mean_success_rate": mean}
-            answer |= {"changed": changed, "revision": crane_env.REVISION}
-            answer["mean_gentle_rate"] = sum(r["gentle"] for r in records) / len(records)
-            costs = mean_costs(records)  # JSON has no NaN
-            answer["costs"] = {name: None if np.isnan(x) else x for name, x in costs.items()}
-            print(json.dumps(answer), flush=True)
+            where = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
+            print_json(records, cells, where | {"seed": args.seed, "changed": changed})
         else:
             what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
             what += "".join(f", {option}={value!r}" for option, value in changed.items())

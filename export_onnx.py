@@ -56,6 +56,8 @@ class MeanAction(nn.Module):
 def main(policy: Positional[Path], file: Positional[Path]) -> None:
     """policy: a run's folder or a policy.pt; file: the .onnx file to write."""
     crane_runs.one_line_errors()
+    if file.suffix != ".onnx":
+        raise SystemExit(f"{file} must end in .onnx")
     agent, task, algorithm = eval_crane.load_policy(policy)
     if not hasattr(agent, "obs_mean"):
         raise SystemExit(f"{policy} is no policy.pt of this repository's scripts")

@@ -99,7 +99,7 @@ def stills(policy: Any, task: dict) -> None:
 def failures(policy: Any, task: dict) -> None:
     """Up to six failed trials of the 600, as they ended: of each diameter and failure one first."""
     args = eval_crane.Args(seed=SEED)
-    records = eval_crane.judge(policy, *eval_crane.task_of(args, task), args)
+    records = list(eval_crane.judge(policy, *eval_crane.task_of(args, task), args))
     kinds: dict[tuple, list[int]] = {}
     for index, record in enumerate(records):
         if record["failure"]:

@@ -22,6 +22,8 @@ import fill_docs  # noqa: E402
 import leaderboard  # noqa: E402
 import make_notebook  # noqa: E402
 
+import eval_crane  # noqa: E402
+
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
 
 
@@ -117,6 +119,30 @@ def test_recipe_of_stable_baselines3(tmp_path):
     ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     assert "Stable-Baselines3 (sb3_ppo.zip)" in run(tmp_path, judge, *QUICK)
+
+
+def test_recipe_of_a_normalized_model(tmp_path, monkeypatch, capsys):
+    """The recipe acts as in the training. The bare .zip does not, and the judge warns of it."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from sb3_crane import CraneVecEnv
+
+    cranes = VecNormalize(CraneVecEnv(4))
+    model = PPO("MlpPolicy", cranes, n_steps=16, batch_size=64, device="cpu")
+    model.learn(64)
+    monkeypatch.chdir(tmp_path)
+    model.save("sb3_ppo")
+    cranes.save("statistics.pkl")
+    code, _ = recipe(4)
+    (tmp_path / "my_normalized.py").write_text(code)
+    obs = cranes.get_original_obs()
+    expected = model.predict(cranes.normalize_obs(obs), deterministic=True)[0]
+    actions = eval_crane.OwnPolicy("my_normalized:Normalized").predict(obs, None)[0]
+    np.testing.assert_array_equal(actions, expected)
+    bare = eval_crane.load_policy(tmp_path / "sb3_ppo.zip")[0]
+    assert "was trained with VecNormalize" in capsys.readouterr().err
+    assert not np.allclose(bare.predict(obs, deterministic=True)[0], expected)
 
 
 @pytest.mark.slow

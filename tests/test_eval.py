@@ -82,6 +82,7 @@ def test_cells():
     assert thin["gentle_rate"] == 0 and thick["gentle_rate"] == 0.5
     assert thick["success_rate"] == 0.75 and thick["failures"] == {"not_held": 1}
     assert thick["trials"] == 4 and thick["interval"] == eval_crane.wilson_interval(3, 4)
+    assert thick["gentle_interval"] == eval_crane.wilson_interval(2, 4)
 
 
 def test_json_and_csv(tmp_path):
@@ -97,13 +98,37 @@ def test_json_and_csv(tmp_path):
         assert cell["trials"] == 2 and cell["successes"] == 0 and cell["success_rate"] == 0
         assert cell["failures"] == {"not_reached": 2}
         assert cell["interval"][0] == 0 and 0.6 < cell["interval"][1] < 0.7
-    assert answer["mean_success_rate"] == 0
+    assert answer["mean_success_rate"] == answer["mean_gentle_rate"] == 0
+    assert answer["mean_success_interval"] == list(eval_crane.wilson_interval(0, 4))
+    assert answer["trials"] == 4 and answer["versions"]["mujoco"] == mujoco.__version__
     costs = answer["costs"]  # without a success only the force on the ground is known
     assert costs["peak [kN]"] == 0 and costs["up [s]"] is costs["oil [l]"] is None
     rows = list(csv.DictReader(file.open()))
     assert [row["diameter"] for row in rows] == ["0.4", "0.4", "0.8", "0.8"]
     assert {row["failure"] for row in rows} == {"not_reached"}
     assert {row["pose_noise"] for row in rows} == {"none"}
+    assert [row["trial"] for row in rows] == ["0", "1", "0", "1"]
+    assert {row["seed"] for row in rows} == {"5"}
+
+
+def test_an_interrupted_judge_keeps_its_trials(run_here, tmp_path, monkeypatch):
+    """Ctrl-C in the second batch of the second table."""
+    monkeypatch.setattr(eval_crane, "CRANES", 2)
+    play, batches = eval_crane.run_trials, []
+
+    def interrupted(*args):
+        batches.append(args)
+        if len(batches) == 4:
+            raise KeyboardInterrupt
+        return play(*args)
+
+    monkeypatch.setattr(eval_crane, "run_trials", interrupted)
+    file = tmp_path / "trials.csv"
+    with pytest.raises(KeyboardInterrupt):
+        line = ("--policy", "zero", "--trials", "2", "--diameters", "0.4", "0.8", "--csv", file)
+        run_here(*line)
+    rows = [(row["pose_noise"], row["diameter"]) for row in csv.DictReader(file.open())]
+    assert rows == [("none", "0.4")] * 2 + [("none", "0.8")] * 2 + [("step", "0.4")] * 2
 
 
 def test_both_tables_unless_noise_is_given(run_here, tmp_path):
@@ -139,7 +164,8 @@ def test_table_of_costs(capsys):
     records = [good | {"litres": 3.0}, rough | {"litres": 5.0}, bad | {"litres": 1.0}]
     eval_crane.print_care(records, eval_crane.summarize(records))
     rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if "|" in line]
-    expected = "33.3 2.00 0.00 0.10 4.00 0.00 0.00 4.50 0.00 0.00".split()
+    interval = "{:5.1f} - {:5.1f}".format(*(100 * x for x in eval_crane.wilson_interval(1, 3)))
+    expected = ["33.3", interval.strip(), *"2.00 0.00 0.10 4.00 0.00 0.00 4.50 0.00 0.00".split()]
     assert [cell.strip() for cell in rows[2]] == ["0.5", *expected]
     assert [cell.strip() for cell in rows[3]] == ["all", *expected]
 
@@ -307,7 +333,7 @@ def test_stochastic_trials_from_the_command_line(run_here, tmp_path):
 def test_sdf_trials():
     policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
     args = Args(trials=2, diameters=(0.5,), seed=3, env_threads=1)
-    records = judge(policy, CRANE, {"contact": "sdf"}, args)
+    records = list(judge(policy, CRANE, {"contact": "sdf"}, args))
     assert len(records) == 2 and any(record["success"] for record in records)
 
 
@@ -365,11 +391,11 @@ def test_same_trial_in_any_batch(monkeypatch):
     With fixed actions to the bit; a network's rounding may change with the size of its batch.
     """
     args = Args(trials=4, diameters=(0.3, 0.7), seed=3, env_threads=1)
-    together = judge(FixedPolicy("zero"), CRANE, {}, args)
+    together = list(judge(FixedPolicy("zero"), CRANE, {}, args))
     assert [record["diameter"] for record in together] == [0.3] * 4 + [0.7] * 4
     assert len({record["centre_miss"] for record in together}) == 8
     monkeypatch.setattr(eval_crane, "CRANES", 3)
-    assert judge(FixedPolicy("zero"), CRANE, {}, args) == together
+    assert list(judge(FixedPolicy("zero"), CRANE, {}, args)) == together
 
 
 @pytest.mark.slow

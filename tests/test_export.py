@@ -98,3 +98,26 @@ def test_damaged_files_are_named(tmp_path, kind):
     path.write_bytes(b"junk")
     with pytest.raises(SystemExit, match=f"policy.{kind}"):
         eval_crane.load_policy(path)
+
+
+def test_an_onnx_file_of_others_is_told_what_to_do(tmp_path):
+    import onnx
+
+    path = tmp_path / "policy.onnx"
+    kind = onnx.TensorProto.FLOAT
+    obs, actions = (
+        onnx.helper.make_tensor_value_info(name, kind, ["N", width])
+        for name, width in (("obs", 6), ("actions", 6))
+    )
+    node = onnx.helper.make_node("Tanh", ["obs"], ["actions"])
+    graph = onnx.helper.make_graph([node], "g", [obs], [actions])
+    opset = [onnx.helper.make_opsetid("", 17)]
+    onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), path)
+    with pytest.raises(SystemExit, match="not of export_onnx.py.*--policy my_module:MyPolicy"):
+        eval_crane.load_policy(path)
+
+
+def test_the_files_name_is_checked_first(tmp_path):
+    with pytest.raises(SystemExit, match="policy.bin must end in .onnx"):
+        export_onnx.main(eval_crane.SHIPPED, tmp_path / "policy.bin")
+    assert not list(tmp_path.iterdir())

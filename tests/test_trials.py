@@ -246,7 +246,7 @@ def test_training_and_judging_agree():
     assert scores == pytest.approx(expected) and scores.keys() == expected.keys()
 
     args = eval_crane.Args(trials=trials, seed=seed, env_threads=1)
-    records = eval_crane.judge(policy, "ForestryCrane-v0", {}, args)
+    records = list(eval_crane.judge(policy, "ForestryCrane-v0", {}, args))
     assert [r["success"] for r in records] == success.tolist()
     assert [r["diameter"] for r in records] == diameters.tolist()
     assert {r["failure"] for r, lazy in zip(records, idle) if lazy} == {"not_reached"}
