@@ -43,7 +43,7 @@ BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes t
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 VALVE_STEPS = 4  # physics steps between two looks of the valves at the command
 PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
-MIN_LEVER = 0.05  # m; below q2 = -1.12 rad the boom's computed lever is smaller or negative
+MIN_LEVER = 0.05  # m; below q2 = -1.13 rad the boom's computed lever is smaller or negative
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
 # The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
 OIL = np.array(
