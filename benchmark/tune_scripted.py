@@ -4,9 +4,9 @@
     python benchmark/tune_scripted.py randomized
 
 The search starts from a set of `scripted_crane.py`. Each candidate is the best set so far with
-about half of its numbers multiplied by exp(N(0, 0.3)). It is judged in trials of seed 10000, the
-same for all. The score is success plus gentle success. Every candidate is a row of the file. The
-last lines that are printed are the best set, to be copied into scripted_crane.py.
+about half of its numbers multiplied by exp(N(0, 0.2^2)). It is judged in trials of seed 10000, the
+same for all. The score is success plus gentle success. Every candidate is a row of the file. At
+the end the best set is printed, to be copied into scripted_crane.py.
 """
 
 import csv
@@ -29,8 +29,8 @@ from crane_options import Range, Seed
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane, Settings
 
 FILE = Path(__file__).with_suffix(".csv")
-SPREAD = 0.3  # standard deviation of the logarithm of a changed number
-FIXED_AT = {"jaw_speed": 1.0, "squeeze": 1.0}  # largest command of an actuator
+SPREAD = 0.2  # standard deviation of the logarithm of a changed number
+LARGEST = {"jaw_speed": 1.0, "meeting_speed": 1.0, "squeeze": 1.0}  # commands of the jaws
 
 
 def neighbour(settings: Settings, rng: np.random.Generator) -> Settings:
@@ -38,7 +38,7 @@ def neighbour(settings: Settings, rng: np.random.Generator) -> Settings:
     numbers = {}
     for name, value in settings._asdict().items():
         factor = np.exp(SPREAD * rng.standard_normal()) if rng.random() < 0.5 else 1.0
-        numbers[name] = float(f"{min(value * factor, FIXED_AT.get(name, np.inf)):.3g}")
+        numbers[name] = float(f"{min(value * factor, LARGEST.get(name, np.inf)):.3g}")
     return Settings(**numbers)
 
 
@@ -58,7 +58,7 @@ def main(
     with open(FILE, "a", newline="") as file:
         writer = csv.writer(file)
         if new:
-            writer.writerow(["level", "seed", "candidate", "success", "gentle", *Settings._fields])
+            writer.writerow(["task", "seed", "candidate", "success", "gentle", *Settings._fields])
         progress = trange(candidates, unit="set")
         for candidate in progress:
             settings = neighbour(best, rng) if candidate else best

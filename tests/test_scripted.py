@@ -5,9 +5,10 @@ import pytest
 
 import crane_task
 from crane_env import CraneVectorEnv
-from crane_trials import monte_carlo_trials
+from crane_trials import make_envs, monte_carlo_trials, run_trials
 from scripted_crane import (
     DAMPING,
+    HYDRAULIC,
     SPEED,
     ScriptedCrane,
     damped_least_squares,
@@ -91,6 +92,19 @@ def test_it_grasps_and_lifts(signed_yaw):
         alive &= ~terminated
     success = alive & info["success"]
     assert success.all(), dict(zip(diameters[~success], info["termination"][~success]))
+
+
+def test_jaws_that_close_higher_around_thick_logs_do_not_pull_the_crane_down():
+    """Without `rise` the tips reach under the log, and the soft drives give way."""
+    diameters, seeds = monte_carlo_trials(10_000, 4, [0.7])
+    gentle = {}
+    for rise in (HYDRAULIC.rise, 0.0):
+        envs = make_envs("ForestryCraneHydraulic-v0", len(seeds), 1, diameter=diameters)
+        policy = ScriptedCrane(settings=HYDRAULIC._replace(rise=rise))
+        results = run_trials(policy, envs, seeds)
+        assert results["success"].sum() >= 3
+        gentle[rise] = results["gentle"].sum()
+    assert gentle[HYDRAULIC.rise] >= 3 and gentle[0.0] <= 1
 
 
 def test_its_memory_is_that_of_one_batch_of_trials():
