@@ -62,26 +62,34 @@ def leaderboard() -> str:
 
 
 def results() -> str:
-    """README's table: our methods and the paper's, exact pose, success and gentle by level."""
-    scripts = {
-        "mPPO": "`mppo_beta_crane.py`",
-        "PPO": "`ppo_crane.py`",
-        "TRPO": "`trpo_crane.py`",
-        "recurrent PPO": "`recurrent_ppo_crane.py`",
-        "scripted": "`scripted_crane.py`, no learning",
-    }
-    scores = {}
-    for row in rows_of("leaderboard.csv"):
-        scores[row["method"], row["level"]] = [row["success_exact"], row["gentle_exact"]]
+    """README's table: mean, lowest and highest of the training seeds, exact pose, level by level.
+
+    The scripted crane has no seeds. Its row comes from the leaderboard.
+    """
     rows = []
-    for method, name in scripts.items():
-        cells = [scores.get((method, level), ["", ""]) for level in LEVELS]
-        rows.append([name, *sum(cells, [])])
+    for script in plot_curves.LABELS:
+        cells = []
+        for level in LEVELS:
+            mine = [r for r in evaluations(run_of(script, level), "none") if r["gentle"]]
+            for score in ("success", "gentle"):
+                numbers = [float(row[score]) for row in mine]
+                low, high = min(numbers), max(numbers)
+                cells.append(f"{np.mean(numbers):.1f} ({low:.1f}–{high:.1f})")
+        rows.append([f"`{script}.py`", *cells])
+    scripted = {r["level"]: r for r in rows_of("leaderboard.csv") if r["method"] == "scripted"}
+    both = ("success_exact", "gentle_exact")
+    cells = [scripted[level][score] for level in LEVELS for score in both]
+    rows.append(["`scripted_crane.py`, no learning", *cells])
     rows.append(["paper, mPPO", "96.3", "", "", "", "", ""])
     header = ["policy"]
     for level in LEVELS:
         header += [level, "gentle"]
     return table(header, rows)
+
+
+def run_of(script: str, level: str) -> str:
+    """Name of a script's runs on a level, in evaluations.csv."""
+    return f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
 
 
 def seeds() -> str:
@@ -92,7 +100,7 @@ def seeds() -> str:
     lines = []
     for level in LEVELS:
         for script, method in plot_curves.LABELS.items():
-            run = f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
+            run = run_of(script, level)
             mine = [r for r in evaluations(run, "none") if r["gentle"]]
             if not mine:
                 continue
