@@ -38,6 +38,10 @@ Factor = Annotated[float, Range(0, 1_000_000)]
 Exponent = Annotated[float, Range(-20, 20)]
 
 
+class OptionError(ValueError):
+    """A task or an option that cannot be used. The scripts print it without a traceback."""
+
+
 def check(values: Mapping[str, Any], *annotated: Any) -> None:
     """ValueError names a value that its annotation does not allow, and what it allows.
 
@@ -50,7 +54,7 @@ def check(values: Mapping[str, Any], *annotated: Any) -> None:
     for name, value in values.items():
         if name not in annotations:
             known = ", ".join(each for each in annotations if each not in ("options", "return"))
-            raise ValueError(f"there is no option {name!r}, only {known}")
+            raise OptionError(f"there is no option {name!r}, only {known}")
         kind, items = annotations[name], [value]
         if NoneType in get_args(kind):
             kind, items = get_args(kind)[0], [] if value is None else [value]
@@ -69,7 +73,7 @@ def check(values: Mapping[str, Any], *annotated: Any) -> None:
         else:  # a path, a name
             continue
         if not good:
-            raise ValueError(f"{name} must be {needed}, got {value!r}")
+            raise OptionError(f"{name} must be {needed}, got {value!r}")
 
 
 class Options(TypedDict, total=False):
@@ -109,6 +113,6 @@ RANDOMIZED = Options(randomize=1.0, **HYDRAULIC)  # ForestryCraneRandomized-v0
 
 
 def complete(options: Options) -> Options:
-    """The options with all defaults filled in. ValueError names a wrong one and what is allowed."""
+    """The options with all defaults filled in. OptionError names a wrong one and what it allows."""
     check(options, Options)
     return {**DEFAULTS, **options}

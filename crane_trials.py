@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from numpy.random import SeedSequence
 
 from crane_env import CARE, CraneVectorEnv
+from crane_options import OptionError
 from crane_task import CONDITIONS, DIAMETERS, TERMINATIONS, TERMS
 
 RESULTS = {"episodic_return", "success", "termination", "time_to_reach", "centre_miss"}
@@ -44,13 +45,13 @@ def make_envs(
     if is_crane(env_id):
         envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)
     elif unknown := options.keys() - {"retry"}:
-        raise ValueError(f"{env_id} is not the crane and has no option {', '.join(unknown)}")
+        raise OptionError(f"{env_id} is not the crane and has no option {', '.join(unknown)}")
     else:
         autoreset = {"autoreset_mode": AutoresetMode.SAME_STEP}
         envs = gymnasium.make_vec(env_id, num_envs, "sync", vector_kwargs=autoreset)
     for space in (envs.single_observation_space, envs.single_action_space):
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            raise ValueError("its observations or actions are no flat Box")
+            raise OptionError("its observations or actions are no flat Box")
     return RecordEpisodeStatistics(envs)
 
 

@@ -26,6 +26,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
 
+import gymnasium
 import numpy as np
 import torch
 import tyro
@@ -243,13 +244,17 @@ class OwnPolicy:
         module, _, attribute = name.partition(":")
         sys.path.insert(0, os.getcwd())
         try:
-            self.make = getattr(importlib.import_module(module), attribute)
+            found = importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module:  # of an import in the user's module
+                raise
+            raise SystemExit(f"--policy {name}: {error}") from None
+        self.make = getattr(found, attribute, None)
+        try:
             inspect.signature(self.make).bind()
         except (TypeError, ValueError) as error:
             wanted = f"{attribute or 'it'} must be a class or function without arguments"
             raise SystemExit(f"--policy {name}: {error}; {wanted}") from None
-        except (ImportError, AttributeError, SyntaxError) as error:
-            raise SystemExit(f"--policy {name}: {error}") from None
         self.name = name
 
     def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True):
@@ -282,8 +287,9 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     env_id = args.env_id or trained_on["env_id"]
     try:
         on_crane = crane_trials.is_crane(env_id)
-    except Exception as error:  # an unknown id or module raises many kinds
-        raise SystemExit(f"--env-id {env_id}: {error}") from None
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        ours = ", ".join(name for name in gymnasium.registry if name.startswith("ForestryCrane"))
+        raise SystemExit(f"--env-id {env_id}: {error}; of this repository: {ours}") from None
     if not on_crane:
         raise SystemExit(f"--env-id {env_id} is not the crane")
     names = trained_on.keys() & crane_options.DEFAULTS.keys() - {"difficulty", "retry"}

@@ -47,7 +47,7 @@ ALGORITHM = "ppo"
 @dataclass
 class Args:
     # experiment
-    exp_name: str = "ppo_crane"  # name of the run's folder
+    exp_name: str = Path(__file__).stem  # name of the run's folder
     seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
     total_timesteps: Count = 1_024_000  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
@@ -191,7 +191,7 @@ if __name__ == "__main__":
     # Environments
     try:
         envs = crane_trials.make_envs(args.env_id, args.num_envs, args.env_threads, **args.env)
-    except (gymnasium.error.Error, ImportError, ValueError) as error:
+    except (gymnasium.error.Error, ImportError, crane_options.OptionError) as error:
         raise SystemExit(f"{args.env_id}: {error}") from None
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)

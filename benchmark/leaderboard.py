@@ -4,10 +4,11 @@
     python benchmark/leaderboard.py check --method mPPO         # the rows of one method
     python benchmark/leaderboard.py add --method "My method" --level ideal --policy model.zip
 
-`add` judges a policy and writes its row to benchmark/leaderboard.csv. `check` judges the policies
-of the rows again, whose paths begin in the current folder. It fails if a score differs by more than
-TOLERANCE: policies of the same weights differ by a trial or two between processors, through
-rounding.
+`add` judges a policy and writes its row to benchmark/leaderboard.csv, in place of its author's own
+row of the same method and level. fill_docs.py then writes the table of docs/compare.md. `check`
+judges the policies of the rows again, whose paths begin in the current folder. It fails if a score
+differs by more than TOLERANCE: policies of the same weights differ by a trial or two between
+processors, through rounding.
 """
 
 import csv
@@ -46,9 +47,9 @@ class Args:
     method: str = ""
     """name of the method; check: its rows only"""
     level: Literal["ideal", "hydraulic", "randomized"] | None = None
-    """add: level of the new row"""
+    """add: level of the new row; check: rows of this level only"""
     policy: str = ""
-    """of the new row: a file as eval_crane.py takes it, scripted, or my_module:MyPolicy"""
+    """add: a file as eval_crane.py takes it, scripted, or my_module:MyPolicy"""
     training: str = ""
     """what the training took, such as "1.02 million decisions" """
     author: str = ""
@@ -75,12 +76,14 @@ def score(policy: str, level: str) -> dict[str, float]:
     return scores
 
 
-def check(rows: list[dict[str, str]], method: str) -> list[str]:
+def check(rows: list[dict[str, str]], method: str, level: str | None) -> list[str]:
     """One line, also printed at once, for each score that does not come again."""
     wrong = []
-    chosen = [row for row in rows if method in ("", row["method"])]
+    chosen = [
+        row for row in rows if method in ("", row["method"]) and level in (None, row["level"])
+    ]
     if not chosen:
-        raise SystemExit(f"the leaderboard has no method {method!r}")
+        raise SystemExit(f"the leaderboard has no method {method!r} on {level or 'any level'}")
     for row in tqdm(chosen, unit="row"):
         lines, of = [], f"{row['method']} on {row['level']}"
         if row["revision"] != str(crane_env.REVISION):
@@ -106,6 +109,10 @@ def read_rows(board: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def of_the_same(row: dict[str, str], args: Args) -> bool:
+    return (row["method"], row["level"]) == (args.method, args.level)
+
+
 def main() -> None:
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     rows = read_rows(args.board)
@@ -118,14 +125,20 @@ def main() -> None:
     if not args.board.parent.is_dir():
         raise SystemExit(f"no folder {args.board.parent}; make it first")
     if args.what == "check":
-        wrong = check(rows, args.method)
+        if args.policy:
+            raise SystemExit("check judges the policies of the rows; --policy is for add")
+        wrong = check(rows, args.method, args.level)
         raise SystemExit(f"{len(wrong)} differences" if wrong else 0)
     if not (args.method and args.level and args.policy):
         raise SystemExit("add needs --method, --level and --policy")
     new = {name: getattr(args, name) for name in COLUMNS[:-1]} | {"revision": crane_env.REVISION}
+    author = next((row["author"] for row in rows if of_the_same(row, args)), None)
+    if author not in (None, args.author):
+        of = f"{args.method} on {args.level} is a row of {author!r}"
+        raise SystemExit(f"{of}, not of {args.author!r}; choose another --method")
     new |= score(args.policy, args.level)
     rows = read_rows(args.board)  # again: judging takes minutes, and another row may have come
-    same = [row for row in rows if (row["method"], row["level"]) == (args.method, args.level)]
+    same = [row for row in rows if of_the_same(row, args)]
     if same:
         print(f"replaced: {same[0]}")
     rows = [row for row in rows if row not in same] + [new]
@@ -136,6 +149,7 @@ def main() -> None:
         writer.writerows(rows)
     unfinished.replace(args.board)
     print({name: new[name] for name in SCORES})
+    print("now run: python benchmark/fill_docs.py")
 
 
 if __name__ == "__main__":

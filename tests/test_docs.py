@@ -177,7 +177,7 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
     call("add", "--method", "mine", "--policy", "model.zip", "--level", "hydraulic")
     assert "replaced" not in capsys.readouterr().out
     call("add", "--method", "mine", "--policy", "better.zip", "--level", "hydraulic")
-    replaced, _ = capsys.readouterr().out.splitlines()
+    replaced, *_ = capsys.readouterr().out.splitlines()
     assert replaced.startswith("replaced: ") and "'policy': 'model.zip'" in replaced
     call("add", "--method", "mine", "--policy", "model.zip", "--level", "ideal")
     with pytest.raises(SystemExit, match="add needs --method, --level and --policy"):
@@ -192,6 +192,13 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
     assert good.value.code == 0
     with pytest.raises(SystemExit, match="no method 'yours'"):
         call("check", "--method", "yours")
+    with pytest.raises(SystemExit, match="no method 'mine' on randomized"):
+        call("check", "--method", "mine", "--level", "randomized")
+    with pytest.raises(SystemExit, match="--policy is for add"):
+        call("check", "--policy", "model.zip")
+    theirs = ("--level", "ideal", "--author", "somebody else")
+    with pytest.raises(SystemExit, match="mine on ideal is a row of ''"):
+        call("add", "--method", "mine", "--policy", "other.zip", *theirs)
     board.write_text(board.read_text().replace("93.5", "95.0"))
     capsys.readouterr()
     with pytest.raises(SystemExit, match="2 differences"):

@@ -547,6 +547,20 @@ def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
             run_here("--policy", policy, "--trials", "1")
 
 
+def test_errors_of_the_users_code_keep_their_traceback(tmp_path, monkeypatch, run_here):
+    (tmp_path / "broken.py").write_text("import numpy\nnumpy.flot32\n")
+    (tmp_path / "importer.py").write_text("import missing_library\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for words, error in [
+        (("--policy", "broken:Policy"), AttributeError),
+        (("--policy", "importer:Policy"), ModuleNotFoundError),
+        (("--policy", "zero", "--env-id", "broken:Crane-v0"), AttributeError),
+    ]:
+        with pytest.raises(error):
+            run_here(*words, "--trials", "1")
+
+
 @pytest.mark.parametrize("policy", ["file", "zero"])
 @pytest.mark.parametrize("env_id", ["Nowhere-v0", "nowhere:Crane-v0", "Pendulum-v1"])
 def test_clear_errors_of_tasks(run_here, policy, env_id):
