@@ -196,8 +196,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.ctrl, self.qfrc_bias = batch.bind("ctrl"), batch.bind("qfrc_bias")
         self.drive_force, self.sensordata = batch.bind("qfrc_actuator"), batch.bind("sensordata")
         self.log_size, self.log_velocity = batch.geom("log").size, batch.joint("log").qvel
-        # history ends with the last sensor, ground_force: x, y, z in each of the last steps
-        remembered = 3 * self.model.sensor_history[-1, 0]
+        # history ends with ground_force, the only sensor that has one: x, y, z of the last steps
+        remembered = 3 * self.model.sensor_history[:, 0].max()
         self.ground_force = batch.bind("history")[:, -remembered:]
         self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
         velocity, integrators = np.split(self.model.actuator_gainprm, 2)
@@ -452,9 +452,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
-        # as in crane.xml; the crane's force on the ground comes last
-        parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17], axis=1)
-        *poses, touch, support, pressure = parts
+        # as in crane.xml; sensors of your own go behind the crane's force on the ground
+        parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17, 20], axis=1)
+        *poses, touch, support, pressure, _ = parts
         weight = 9.81 * self.batch.body("log").mass[:, 0]
         ground = np.linalg.norm(support, axis=-1) + np.linalg.norm(pressure, axis=-1)
         carried = np.clip(1 - ground / weight, 0, 1)

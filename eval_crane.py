@@ -473,6 +473,7 @@ def check_combinations(args: Args) -> None:
             (args.video or args.viewer) and (args.json or args.csv),
             "--video and --viewer judge nothing: --json and --csv have nothing to write",
         ),
+        (args.video and args.trials != 100, "--video films one trial per diameter; drop --trials"),
         (
             args.video and args.video.suffix.lower() not in (".mp4", ".gif"),
             f"--video: {args.video} must end in .mp4 or .gif",

@@ -118,7 +118,7 @@ def ablations(runs: dict[str, list[Run]]) -> None:
         axis.plot([], [], "o", color=f"C{seed - 1}", label=f"training seed {seed}")
     axis.axvline(100 * PAPER["Table I"], color="black", ls="--", lw=1, label="paper, mPPO, Table I")
     axis.set_yticks(range(len(shown)), list(reversed(shown.values())))
-    axis.set_xlabel("success at the end of 0.6 million decisions [%]")
+    axis.set_xlabel("success at the end of 12.3 million simulation steps [%]")
     axis.set_xlim(-2, 102)
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(0.15, 0.5))
