@@ -405,11 +405,11 @@ def test_an_interrupted_evaluation_is_made_on_resume(tmp_path, run_here, monkeyp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("job", [["--csv", "trials.csv"], ["--video", "film.mp4"]])
+@pytest.mark.parametrize("job", ["--csv trials.csv --trials 2000", "--video film.mp4"])
 def test_ctrl_c_in_the_judge_is_one_line(tmp_path, job):
     file = Path(eval_crane.__file__)
     process = subprocess.Popen(
-        [sys.executable, "-u", str(file), "--policy", "zero", "--trials", "2000", *job],
+        [sys.executable, "-u", str(file), "--policy", "zero", *job.split()],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
