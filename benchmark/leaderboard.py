@@ -6,7 +6,7 @@
 
 `add` judges a policy and writes its row to benchmark/leaderboard.csv, in place of its author's own
 row of the same method and level. fill_docs.py then writes the table of docs/compare.md. `check`
-judges the policies of the rows again, whose paths begin in the current folder. It fails if a score
+judges the policies of the rows again. Their paths begin in the current folder. It fails if a score
 differs by more than TOLERANCE: policies of the same weights differ by a trial or two between
 processors, through rounding.
 """
