@@ -54,7 +54,12 @@ class MeanAction(nn.Module):
 
 
 def main(policy: Positional[Path], file: Positional[Path]) -> None:
-    """policy: a run's folder or a policy.pt; file: the .onnx file to write."""
+    """Write the file.
+
+    Args:
+        policy: a run's folder or a policy.pt
+        file: the .onnx file to write
+    """
     crane_runs.one_line_errors()
     if file.suffix != ".onnx":
         raise SystemExit(f"{file} must end in .onnx")

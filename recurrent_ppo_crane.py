@@ -82,7 +82,7 @@ class Args:
     narrowing: Exponent = 1.25  # fall of log sigma by schedule; the gradient moves it as well
 
     # evaluation
-    eval_every: Annotated[int, Range(0, 10**10)] = 50  # updates between evaluations, 0 for none
+    eval_every: Annotated[int, Range(0, 10**10)] = 25  # updates between evaluations, 0 for none
     eval_trials: Times = 20  # trials per log diameter in each evaluation
     final_trials: Annotated[int, Range(0, 1000)] = 100  # the same after the training, 0 for none
     eval_seed: Seed = 10_000  # seed of all trials

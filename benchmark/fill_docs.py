@@ -191,13 +191,11 @@ def timed() -> str:
 def algorithms() -> str:
     """evaluations.csv: success of each seed's policy on the ideal level."""
     noises = {"none": "Table I", "step": "Table II"}
-    names = {"timed_mppo_beta_crane": "`mppo_beta_crane.py`, two threads"}
-    names |= {f"curves_{script}": f"`{script}.py`" for script in make_runs.SCRIPTS}
     lines = []
-    for run, name in names.items():
-        line = [name]
+    for script in make_runs.SCRIPTS:
+        line = [f"`{script}.py`"]
         for noise in noises:
-            means = [float(row["success"]) for row in evaluations(run, noise)]
+            means = [float(row["success"]) for row in evaluations(f"curves_{script}", noise)]
             line += [joined(means, 1), f"{np.mean(means):.1f}"]
         lines.append(line)
     paper = [cell for title in noises.values() for cell in ("", f"{100 * PAPER[title]:.1f}")]

@@ -58,8 +58,8 @@ class Args:
 
 
 def score(policy: str, level: str) -> dict[str, float]:
-    """SCORES in % of 600 trials of seed 40000."""
-    judge = [sys.executable, str(HERE.parent / "eval_crane.py"), "--json"]
+    """SCORES in % of 600 trials of seed 60000."""
+    judge = [sys.executable, str(HERE.parent / "eval_crane.py"), "--json", "--seed", "60000"]
     judge += ["--env-id", LEVELS[level]]
     own = policy == "scripted" or ":" in policy
     judge += ["--policy", policy] if own else [policy]

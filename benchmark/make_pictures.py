@@ -30,7 +30,7 @@ import eval_crane
 from crane_trials import monte_carlo_trials
 
 FIGURES = Path(__file__).parent.parent / "assets" / "figures"
-SEED = 40_000
+SEED = 60_000
 FPS = 10  # a frame each decision
 
 

@@ -1,12 +1,14 @@
-"""Draw curves/*.csv and ablations/*.csv into assets/figures.
+"""Draw learning curves: those of the repository, or those of the runs that you name.
 
 Minutes are those of rollouts and updates, without evaluations, on the machine of the run.
 
-    python benchmark/plot_curves.py
+    python benchmark/plot_curves.py  # curves/, levels/ and ablations/ into assets/figures
+    python benchmark/plot_curves.py runs/*__my_mppo__*/ benchmark/curves/mppo_beta_crane_seed*.csv
 """
 
 import csv
 import sys
+import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -15,6 +17,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
+from export_curve import export  # noqa: E402
+from tyro.conf import Positional  # noqa: E402
 
 HERE = Path(__file__).parent
 FIGURES = HERE.parent / "assets" / "figures"
@@ -47,18 +51,44 @@ ABLATIONS = {  # what they change
 FRAME_SKIP = {"frame_skip_10": 10, "frame_skip_4": 4}  # of runs that do not have 20
 
 
+def read_csv(path: Path) -> Run:
+    """The columns of a CSV file of export_curve.py, its simulation steps and minutes."""
+    with open(path) as file:
+        rows = list(csv.DictReader(file))
+    if not rows or not rows[0].keys() >= {"decisions", "rollout_s", "update_s"}:
+        raise SystemExit(f"{path} is no curve; benchmark/export_curve.py makes one from a run")
+    run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
+    name = path.stem.partition("_seed")[0]
+    run["simulation_steps"] = run["decisions"] * FRAME_SKIP.get(name, 20)
+    run["minutes"] = np.nancumsum(run["rollout_s"] + run["update_s"]) / 60
+    return run
+
+
 def read(folder: str) -> dict[str, list[Run]]:
     """Runs by name, one a seed."""
     runs: dict[str, list[Run]] = {}
     for path in sorted((HERE / folder).glob("*_seed*.csv")):
-        with open(path) as file:
-            rows = list(csv.DictReader(file))
         name, seed = path.stem.split("_seed")
-        run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
-        run["seed"] = seed
-        run["simulation_steps"] = run["decisions"] * FRAME_SKIP.get(name, 20)
-        run["minutes"] = np.nancumsum(run["rollout_s"] + run["update_s"]) / 60
-        runs.setdefault(name, []).append(run)
+        runs.setdefault(name, []).append(read_csv(path) | {"seed": seed})
+    return runs
+
+
+def read_paths(paths: tuple[Path, ...]) -> dict[str, list[Run]]:
+    """Runs by name, one a seed, from folders of runs and from CSV files of export_curve.py."""
+    runs: dict[str, list[Run]] = {}
+    for path in paths:
+        if path.is_dir():
+            name = (path.resolve().name.split("__") + [""])[1]  # <task>__<name>__<seed>__<time>
+            with tempfile.TemporaryDirectory() as folder:
+                export(path, Path(folder) / "curve.csv")
+                run = read_csv(Path(folder) / "curve.csv")
+        elif path.is_file():
+            name, run = path.stem.partition("_seed")[0], read_csv(path)
+        else:
+            raise SystemExit(f"no run and no CSV file {path}")
+        if not np.isfinite(run.get("eval_success_rate", np.nan)).any():
+            raise SystemExit(f"{path} has no evaluation yet (--eval-every)")
+        runs.setdefault(name or path.stem, []).append(run)
     return runs
 
 
@@ -77,12 +107,14 @@ def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style)
     axis.fill_between(xs * scale, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
 
 
-def save(figure: plt.Figure, name: str) -> None:
+def save(figure: plt.Figure, path: Path) -> None:
     figure.tight_layout()
-    figure.savefig(FIGURES / name, metadata={"Date": None})
+    # no date in an .svg, so that the same curves give the same file
+    figure.savefig(path, dpi=200, metadata={"Date": None} if path.suffix == ".svg" else None)
+    plt.close(figure)
 
 
-def learning_curves(runs: dict[str, list[Run]]) -> None:
+def learning_curves(runs: dict[str, list[Run]], path: Path) -> None:
     columns = [("decisions", 1e-6, "decisions [million]"), ("minutes", 1, "minutes of training")]
     rows = [
         ("eval_success_rate", "success of the mean action"),
@@ -92,7 +124,8 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
     for color, (name, seeds) in enumerate(runs.items()):
         for line, (y, title) in enumerate(rows):
             for column, (x, scale, _) in enumerate(columns):
-                label = f"{LABELS.get(name, name)}, {len(seeds)} seeds"
+                count = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+                label = f"{LABELS.get(name, name)}, {count}"
                 draw(axes[line, column], seeds, x, y, scale, color=f"C{color}", label=label)
                 axes[line, column].grid(alpha=0.3)
             axes[line, 0].set_ylabel(title)
@@ -101,10 +134,27 @@ def learning_curves(runs: dict[str, list[Run]]) -> None:
     for axis in axes[0]:
         axis.axhline(PAPER["Table I"], color="black", ls="--", lw=1, label="paper, mPPO, Table I")
     axes[0, 0].legend(fontsize=8)
-    save(figure, "learning_curves.svg")
+    save(figure, path)
 
 
-def ablations(runs: dict[str, list[Run]]) -> None:
+def level_curves(runs: dict[str, list[Run]], path: Path) -> None:
+    """Success and gentle success on the harder levels."""
+    rows = [("eval_success_rate", "success"), ("eval_gentle_rate", "gentle success")]
+    figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), sharex="col", sharey=True)
+    for column, level in enumerate(("hydraulic", "randomized")):
+        for color, (script, label) in enumerate(LABELS.items()):
+            for line, (y, title) in enumerate(rows):
+                axis, seeds = axes[line, column], runs[f"{script}_{level}"]
+                draw(axis, seeds, "decisions", y, 1e-6, color=f"C{color}", label=label)
+                axis.grid(alpha=0.3)
+                axes[line, 0].set_ylabel(f"{title} of the mean action")
+        axes[0, column].set_title(f"{level} level")
+        axes[1, column].set_xlabel("decisions [million]")
+    axes[0, 0].legend(fontsize=8)
+    save(figure, path)
+
+
+def ablations(runs: dict[str, list[Run]], path: Path) -> None:
     """One line per change with a dot per seed."""
     shown = {name: label for name, label in ABLATIONS.items() if name in runs}
     if not shown:
@@ -122,15 +172,29 @@ def ablations(runs: dict[str, list[Run]]) -> None:
     axis.set_xlim(-2, 102)
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(0.15, 0.5))
-    save(figure, "ablations.svg")
+    save(figure, path)
 
 
-def main() -> None:
-    curves = read("curves")
-    if not curves:
+def main(runs: Positional[tuple[Path, ...]] = (), figure: Path = Path("curves.svg")) -> None:
+    """Draw.
+
+    Args:
+        runs: folders of runs, or CSV files of export_curve.py; runs of one name are its seeds
+        figure: file for the curves of these runs, .svg, .png or .pdf
+    """
+    if runs:
+        if figure.suffix not in (".svg", ".png", ".pdf"):
+            sys.exit(f"{figure} must end in .svg, .png or .pdf")
+        if not figure.absolute().parent.is_dir():
+            sys.exit(f"no folder {figure.absolute().parent}; make it first")
+        learning_curves(read_paths(runs), figure)
+        print(f"written to {figure}")
+        return
+    if not (curves := read("curves")):
         sys.exit("benchmark/curves has no CSV: benchmark/make_runs.py curves makes them")
-    learning_curves(curves)
-    ablations(read("ablations"))
+    learning_curves(curves, FIGURES / "learning_curves.svg")
+    level_curves(read("levels"), FIGURES / "level_curves.svg")
+    ablations(read("ablations"), FIGURES / "ablations.svg")
 
 
 if __name__ == "__main__":

@@ -431,6 +431,11 @@ def test_clear_errors(tmp_path, run_here, capsys):
 
     assert "no file nowhere.pt" in error_of("nowhere.pt")
     assert "no file scripted; --policy scripted" in error_of("scripted")
+    for run in ("old", "new"):
+        (tmp_path / "runs" / run).mkdir(parents=True)
+        (tmp_path / "runs" / run / "policy.pt").touch()
+    os.utime(tmp_path / "runs" / "old" / "policy.pt", (0, 0))
+    assert f"the newest run below it is {tmp_path}/runs/new" in error_of(tmp_path / "runs")
     assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
     assert "names a diameter twice" in error_of("--diameters", "0.5", "0.5")

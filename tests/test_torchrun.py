@@ -38,7 +38,7 @@ def look(cwd, how, ranks, *arguments):
     """What each rank of ranks_program.py left."""
     cwd.mkdir()
     result = torchrun(cwd, PROGRAM, cwd, how, *arguments, ranks=ranks)
-    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.returncode == 0, result.stderr
     return [torch.load(cwd / f"rank{r}.pt", weights_only=True) for r in range(ranks)]
 
 
@@ -109,7 +109,7 @@ def test_a_killed_rank_ends_the_run_and_any_number_of_ranks_goes_on(tmp_path):
     done = torch.load(folder / "checkpoint.pt", weights_only=True)["iteration"]
     line = [SCRIPT, "--resume", folder, "--total-timesteps", 64 * (done + 1)]
     result = torchrun(tmp_path, *line, ranks=1)
-    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.returncode == 0, result.stderr
     done += 1
     assert scalars(folder)["time/updates"] == list(range(1, done + 1))
 
@@ -127,7 +127,7 @@ def test_two_machines_train_together(tmp_path):
         nodes.append(torchrun(tmp_path, *line, ranks=1, how=how, start=subprocess.Popen))
     for node in nodes:
         _, errors = node.communicate(timeout=120)
-        assert node.returncode == 0, errors[-2000:]
+        assert node.returncode == 0, errors
     first, second = (torch.load(tmp_path / f"rank{r}.pt", weights_only=True) for r in (0, 1))
     assert all(torch.equal(w, second["weights"][k]) for k, w in first["weights"].items())
     assert only_run(tmp_path)

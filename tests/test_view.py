@@ -143,7 +143,7 @@ def test_a_lever_moves_its_joint_until_it_is_let_go(monkeypatch):
 def test_what_is_shown_is_the_trial_that_is_judged(env_id):
     """To the last bit, though it is drawn several times in a decision."""
     options = {"diameter": 0.3, "pose_noise": "step"}
-    seed = monte_carlo_trials(40_000, 1, [0.3])[1]
+    seed = monte_carlo_trials(10_000, 1, [0.3])[1]
     scripted = ScriptedCrane(settings=IDEAL)
     judged = crane_trials.run_trials(scripted, crane_trials.make_envs(env_id, 1, **options), seed)
     crane = CraneVectorEnv(1, **options, **gymnasium.spec(env_id).kwargs)
@@ -171,7 +171,7 @@ def test_the_next_trial_is_the_judges(monkeypatch):
     look(monkeypatch, [(5, "ENTER"), (15, "BACKSPACE"), (25, "DOWN"), (35, "ESCAPE")])
     starts = starts[1:]  # the first opens the window
     for k, (trial, diameter) in enumerate([(0, 0.4), (1, 0.4), (1, 0.4), (1, 0.3)]):
-        seed = monte_carlo_trials(40_000, 2, [diameter])[1][trial]
+        seed = monte_carlo_trials(10_000, 2, [diameter])[1][trial]
         judged = CraneVectorEnv(1, diameter=diameter)
         judged.reset(seed=[seed])
         np.testing.assert_array_equal(starts[k][0], judged.state().q[0])
