@@ -241,7 +241,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     corner = None if args.camera == "grapple" else Photographer(crane, 1 / 3, "grapple")
     gif = args.video.suffix.lower() == ".gif"
     how = {"duration": 1000 / FPS, "loop": 0} if gif else {"fps": FPS, "macro_block_size": 2}
-    diameters, seeds = monte_carlo_trials(args.seed, 1, args.diameters)
+    seeds = [monte_carlo_trials(args.seed, args.trial + 1, [d])[1][-1] for d in args.diameters]
     frames = round(crane_task.TIME_LIMIT * FPS) * len(seeds)  # fewer where a trial ends early
     bar, filmed = tqdm(total=frames, unit="frame", leave=False), 0.0
     with whole_file(args.video) as path, bar, imageio.get_writer(path, **how) as video:
@@ -261,7 +261,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             bar.update()
 
         crane.watch = watch
-        for diameter, seed in zip(diameters, seeds):
+        for diameter, seed in zip(args.diameters, seeds):
             trial = Trial(crane, seed, diameter)
             while not trial.ended:
                 trial.advance(policy, not args.stochastic)
@@ -319,7 +319,8 @@ def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     if task == {"axes": "crane", "offset": "plus", "frame_skip": 20}:  # what it knows
         settings = HYDRAULIC if crane.options["actuators"] == "hydraulic" else IDEAL
         drivers["scripted"] = ScriptedCrane(crane.options["signed_yaw"], settings)
-    names, number, diameter, speed, paused = list(drivers), 0, args.diameters[0], 1.0, False
+    names, number, diameter = list(drivers), args.trial, args.diameters[0]
+    speed, paused = 1.0, False
     drawn_at = time.time()
 
     def new_trial() -> Trial:

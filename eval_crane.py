@@ -100,6 +100,8 @@ class Args:
     Its rates are shares in [0, 1]"""
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
+    trial: Annotated[int, Range(0, 9_999)] = 0
+    """number of the filmed trial, and of the first in the window, as in the column of --csv"""
     camera: Literal["overview", "side", "grapple"] = "overview"
     """camera of the film and of the window"""
     width: Annotated[int, Range(64, 1920)] = 640
@@ -476,6 +478,7 @@ def check_combinations(args: Args) -> None:
             "--video and --viewer judge nothing: --json and --csv have nothing to write",
         ),
         (args.video and args.trials != 100, "--video films one trial per diameter; drop --trials"),
+        (args.trial and not (args.video or args.viewer), "--trial is for --video and --viewer"),
         (
             args.video and args.video.suffix.lower() not in (".mp4", ".gif"),
             f"--video: {args.video} must end in .mp4 or .gif",

@@ -21,6 +21,7 @@ import crane_options
 import crane_runs
 import crane_task
 import crane_trials
+import crane_view
 import eval_crane
 import machine
 from eval_crane import Args, FixedPolicy, judge
@@ -410,9 +411,17 @@ def test_video(tmp_path, run_here, monkeypatch, kind):
     except Exception as error:
         pytest.skip(f"no OpenGL here: {error}")
     monkeypatch.setattr(crane_task, "REACH_TIME", 0.4)  # an idle crane fails then
-    film = tmp_path / f"film.{kind}"
+    film, seeds = tmp_path / f"film.{kind}", []
+
+    class Trial(crane_view.Trial):
+        def __init__(self, crane, seed, diameter):
+            seeds.append(seed.spawn_key)
+            super().__init__(crane, seed, diameter)
+
+    monkeypatch.setattr(crane_view, "Trial", Trial)
     line = ("--policy", "zero", "--diameters", "0.5", "0.7", "--video", film, "--width", "128")
-    assert f"2 trials filmed in {film}" in run_here(*line).out
+    assert f"2 trials filmed in {film}" in run_here(*line, "--trial", "3").out
+    assert seeds == [(500, 3), (700, 3)]  # as the fourth trials of monte_carlo_trials
     frames = imageio.mimread(film, memtest=False)
     assert frames[0].shape[:2] == (72, 128) and np.std(frames[0]) > 10
     # 20 frames a second and ten of the end; a .gif leaves out frames that are as the one before
@@ -442,6 +451,7 @@ def test_clear_errors(tmp_path, run_here, capsys):
     assert "mean action only" in error_of("policy.onnx", "--stochastic")
     assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
     assert "brings its own" in error_of("--no-signed-yaw")
+    assert "--trial is for --video" in error_of("--trial", "3")
     wide = error_of("--video", "lift.mp4", "--width", "4000")
     assert "width must be a whole number in [64, 1,920], got 4000" in wide
     assert "--width must be even" in error_of("--video", "lift.mp4", "--width", "321")
