@@ -39,8 +39,7 @@ LEVELS = {  # flags of each script on the harder levels
         "trpo_crane": "--total-timesteps 1536000 --warm-up 0.6 --num-envs 128 "
         "--minibatch-size 2048 --fisher-samples 2048 --cg-iterations 5 "
         "--env.retry 0.5",
-        "ppo_crane": "--total-timesteps 1536000 --learning-rate 4e-4 --num-envs 128 "
-        "--minibatch-size 2048",
+        "ppo_crane": "--total-timesteps 1536000 --num-envs 128 --minibatch-size 2048",
         "recurrent_ppo_crane": "--total-timesteps 1536000 --num-envs 128 --env.retry 0.5",
     },
     "Randomized": {
