@@ -66,7 +66,7 @@ class Args:
     hidden_sizes: tuple[Width, ...] = (256, 256)  # hidden layers of the actor and of the critic
     lstm_size: Width = 64  # width of the memory that actor and critic read
     normalize_obs: bool = True  # scale observations by their running mean and deviation
-    learning_rate: Factor = 7e-4  # Adam's step size at the start
+    learning_rate: Factor = 4e-4  # Adam's step size at the start
     gamma: Share = 0.97  # discount per 0.1 s at the start
     horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s

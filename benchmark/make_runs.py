@@ -40,7 +40,8 @@ LEVELS = {  # flags of each script on the harder levels
         "--minibatch-size 2048 --fisher-samples 2048 --cg-iterations 5 "
         "--env.retry 0.5",
         "ppo_crane": "--total-timesteps 1536000 --num-envs 128 --minibatch-size 2048",
-        "recurrent_ppo_crane": "--total-timesteps 1536000 --num-envs 128 --env.retry 0.5",
+        "recurrent_ppo_crane": "--total-timesteps 1536000 --learning-rate 7e-4 --num-envs 128 "
+        "--env.retry 0.5",
     },
     "Randomized": {
         "mppo_beta_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 "
@@ -50,8 +51,8 @@ LEVELS = {  # flags of each script on the harder levels
         "--env.retry 0.5",
         "ppo_crane": "--total-timesteps 4096000 --learning-rate 5e-4 --warm-up 0.2 --num-envs 128 "
         "--minibatch-size 2048",
-        "recurrent_ppo_crane": "--total-timesteps 4096000 --warm-up 0.2 --num-envs 128 "
-        "--env.retry 0.5",
+        "recurrent_ppo_crane": "--total-timesteps 4096000 --learning-rate 7e-4 --warm-up 0.2 "
+        "--num-envs 128 --env.retry 0.5",
     },
 }
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
