@@ -101,7 +101,8 @@ class Args:
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     trial: Annotated[int, Range(0, 9_999)] = 0
-    """number of the filmed trial, and of the first in the window, as in the column of --csv"""
+    """number of the filmed trial, and of the first in the window, as in the column `trial` of
+    --csv. Give its --seed and --pose-noise too"""
     camera: Literal["overview", "side", "grapple"] = "overview"
     """camera of the film and of the window"""
     width: Annotated[int, Range(64, 1920)] = 640
@@ -137,12 +138,13 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     The task is `env_id`, `revision` and all options of the environment. A model of
     Stable-Baselines3 does not know its options.
     """
+    runs = sorted(path.glob("*/policy.pt"), key=os.path.getmtime)
     path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
         built_in = str(path) in ("scripted", "zero", "random")
         mend = f"--policy {path}" if built_in else "train one first, or give a run's policy.pt"
-        if runs := sorted(path.parent.glob("*/policy.pt"), key=os.path.getmtime):
-            mend = f"the newest run below it is {runs[-1].parent}"
+        if runs:
+            mend = f"the newest run there is {runs[-1].parent}"
         raise SystemExit(f"no file {path}; {mend}")
     if path.suffix == ".zip":
         return load_sb3(path), {"env_id": "ForestryCrane-v0"}, "Stable-Baselines3"

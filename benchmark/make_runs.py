@@ -118,7 +118,7 @@ def evaluate(name: str, seed: int, run: Path) -> None:
         command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(run)]
         command += ["--json", "--seed", "60000", "--pose-noise", noise]
         result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
-        row = {"run": name, "seed": str(seed), "pose_noise": noise}
+        row = {"run": name, "seed": str(seed), "pose_noise": noise, "trial_seed": "60000"}
         for cell in result["cells"]:
             row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
         for score in ("success", "gentle"):
@@ -155,9 +155,9 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) ->
             for name in SCRIPTS
         ]
     elif what == "timed":
-        often = ["--eval-trials", "100"]
-        jobs = [(SCRIPTS[0], SCRIPTS[0], seed, often, 2) for seed in (1, 2, 3)]
-        jobs += [level_job(SCRIPTS[0], level, 1, often, 2) for level in LEVELS]
+        exact = ["--eval-trials", "100"]
+        jobs = [(SCRIPTS[0], SCRIPTS[0], seed, exact, 2) for seed in (1, 2, 3)]
+        jobs += [level_job(SCRIPTS[0], level, 1, exact, 2) for level in LEVELS]
     else:
         jobs = [
             (script, name, seed, [*SHORT, *flags.split()], 1)

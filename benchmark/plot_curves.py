@@ -14,6 +14,7 @@ from pathlib import Path
 import matplotlib
 
 matplotlib.use("Agg")
+matplotlib.rcParams["svg.hashsalt"] = "curves"  # the same curves give the same file
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
@@ -53,8 +54,10 @@ FRAME_SKIP = {"frame_skip_10": 10, "frame_skip_4": 4}  # of runs that do not hav
 
 def read_csv(path: Path) -> Run:
     """The columns of a CSV file of export_curve.py, its simulation steps and minutes."""
-    with open(path) as file:
-        rows = list(csv.DictReader(file))
+    rows = []
+    if path.suffix == ".csv":
+        with open(path) as file:
+            rows = list(csv.DictReader(file))
     if not rows or not rows[0].keys() >= {"decisions", "rollout_s", "update_s"}:
         raise SystemExit(f"{path} is no curve; benchmark/export_curve.py makes one from a run")
     run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
@@ -74,11 +77,12 @@ def read(folder: str) -> dict[str, list[Run]]:
 
 
 def read_paths(paths: tuple[Path, ...]) -> dict[str, list[Run]]:
-    """Runs by name, one a seed, from folders of runs and from CSV files of export_curve.py."""
+    """Runs by name and task, from folders of runs and from CSV files of export_curve.py."""
     runs: dict[str, list[Run]] = {}
     for path in paths:
         if path.is_dir():
-            name = (path.resolve().name.split("__") + [""])[1]  # <task>__<name>__<seed>__<time>
+            task, *name = path.resolve().name.split("__")  # <task>__<name>__<seed>__<time>
+            name = f"{name[0]} ({task})" if name else task
             with tempfile.TemporaryDirectory() as folder:
                 export(path, Path(folder) / "curve.csv")
                 run = read_csv(Path(folder) / "curve.csv")
@@ -87,8 +91,8 @@ def read_paths(paths: tuple[Path, ...]) -> dict[str, list[Run]]:
         else:
             raise SystemExit(f"no run and no CSV file {path}")
         if not np.isfinite(run.get("eval_success_rate", np.nan)).any():
-            raise SystemExit(f"{path} has no evaluation yet (--eval-every)")
-        runs.setdefault(name or path.stem, []).append(run)
+            raise SystemExit(f"{path} has no evaluation on the crane yet (--eval-every)")
+        runs.setdefault(name, []).append(run)
     return runs
 
 
@@ -109,7 +113,6 @@ def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style)
 
 def save(figure: plt.Figure, path: Path) -> None:
     figure.tight_layout()
-    # no date in an .svg, so that the same curves give the same file
     figure.savefig(path, dpi=200, metadata={"Date": None} if path.suffix == ".svg" else None)
     plt.close(figure)
 
@@ -124,7 +127,7 @@ def learning_curves(runs: dict[str, list[Run]], path: Path) -> None:
     for color, (name, seeds) in enumerate(runs.items()):
         for line, (y, title) in enumerate(rows):
             for column, (x, scale, _) in enumerate(columns):
-                count = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+                count = f"{len(seeds)} run{'s' if len(seeds) > 1 else ''}"
                 label = f"{LABELS.get(name, name)}, {count}"
                 draw(axes[line, column], seeds, x, y, scale, color=f"C{color}", label=label)
                 axes[line, column].grid(alpha=0.3)
@@ -142,12 +145,13 @@ def level_curves(runs: dict[str, list[Run]], path: Path) -> None:
     rows = [("eval_success_rate", "success"), ("eval_gentle_rate", "gentle success")]
     figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), sharex="col", sharey=True)
     for column, level in enumerate(("hydraulic", "randomized")):
-        for color, (script, label) in enumerate(LABELS.items()):
-            for line, (y, title) in enumerate(rows):
-                axis, seeds = axes[line, column], runs[f"{script}_{level}"]
-                draw(axis, seeds, "decisions", y, 1e-6, color=f"C{color}", label=label)
-                axis.grid(alpha=0.3)
-                axes[line, 0].set_ylabel(f"{title} of the mean action")
+        for line, (y, title) in enumerate(rows):
+            axis = axes[line, column]
+            for color, (script, label) in enumerate(LABELS.items()):
+                if seeds := runs.get(f"{script}_{level}"):
+                    draw(axis, seeds, "decisions", y, 1e-6, color=f"C{color}", label=label)
+            axis.grid(alpha=0.3)
+            axes[line, 0].set_ylabel(f"{title} of the mean action")
         axes[0, column].set_title(f"{level} level")
         axes[1, column].set_xlabel("decisions [million]")
     axes[0, 0].legend(fontsize=8)
@@ -179,11 +183,12 @@ def main(runs: Positional[tuple[Path, ...]] = (), figure: Path = Path("curves.sv
     """Draw.
 
     Args:
-        runs: folders of runs, or CSV files of export_curve.py; runs of one name are its seeds
+        runs: folders of runs, or CSV files of export_curve.py. Runs with the same name and task
+            are one curve, which ends where the shortest of them ends
         figure: file for the curves of these runs, .svg, .png or .pdf
     """
     if runs:
-        if figure.suffix not in (".svg", ".png", ".pdf"):
+        if figure.suffix.lower() not in (".svg", ".png", ".pdf"):
             sys.exit(f"{figure} must end in .svg, .png or .pdf")
         if not figure.absolute().parent.is_dir():
             sys.exit(f"no folder {figure.absolute().parent}; make it first")

@@ -263,6 +263,7 @@ def test_leaderboard_scores_are_the_judges(monkeypatch):
 
     def judge(command, **kwargs):
         assert command[command.index("--env-id") + 1] == "ForestryCraneHydraulic-v0"
+        assert command[command.index("--seed") + 1] == "60000"
         success, gentle = answers[command[command.index("--pose-noise") + 1]]
         answer = {"changed": {}, "mean_success_rate": success, "mean_gentle_rate": gentle}
         return subprocess.CompletedProcess(command, 0, json.dumps(answer))

@@ -444,7 +444,8 @@ def test_clear_errors(tmp_path, run_here, capsys):
         (tmp_path / "runs" / run).mkdir(parents=True)
         (tmp_path / "runs" / run / "policy.pt").touch()
     os.utime(tmp_path / "runs" / "old" / "policy.pt", (0, 0))
-    assert f"the newest run below it is {tmp_path}/runs/new" in error_of(tmp_path / "runs")
+    assert f"the newest run there is {tmp_path}/runs/new" in error_of(tmp_path / "runs")
+    assert "train one first" in error_of(tmp_path / "runs" / "typo")
     assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
     assert "names a diameter twice" in error_of("--diameters", "0.5", "0.5")

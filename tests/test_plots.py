@@ -29,12 +29,13 @@ def test_runs_of_one_name_are_its_seeds(tmp_path):
     ]
     ours = ROOT / "benchmark" / "curves" / "ppo_crane_seed1.csv"
     runs = plot_curves.read_paths((*folders, ours))
-    assert {name: len(seeds) for name, seeds in runs.items()} == {"mine": 2, "ppo_crane": 1}
-    first, second = runs["mine"]
+    counts = {name: len(seeds) for name, seeds in runs.items()}
+    assert counts == {"mine (Task-v0)": 2, "ppo_crane": 1}
+    first, second = runs["mine (Task-v0)"]
     assert list(first["minutes"]) == [1, 2] and list(second["eval_success_rate"]) == [0.25, 1]
     plot_curves.main((*folders, ours), tmp_path / "mine.svg")
     drawn = (tmp_path / "mine.svg").read_text()
-    assert "<!-- mine, 2 seeds -->" in drawn and "<!-- PPO, 1 seed -->" in drawn
+    assert "<!-- mine (Task-v0), 2 runs -->" in drawn and "<!-- PPO, 1 run -->" in drawn
 
 
 def test_what_cannot_be_drawn_is_said_in_a_line(tmp_path):
@@ -45,13 +46,25 @@ def test_what_cannot_be_drawn_is_said_in_a_line(tmp_path):
         "nowhere": "no run and no CSV file",
         "empty": "holds no TensorBoard scalars",
         "new": "holds no TensorBoard scalars",
-        "blind": "has no evaluation yet",
+        "blind": "has no evaluation on the crane yet",
     }
     for name, said in cases.items():
         with pytest.raises(SystemExit, match=said):
             plot_curves.main((tmp_path / name,), tmp_path / "mine.svg")
-    with pytest.raises(SystemExit, match="is no curve"):
-        plot_curves.main((ROOT / "benchmark" / "evaluations.csv",), tmp_path / "mine.svg")
+    for path in ("benchmark/evaluations.csv", "assets/policies/ppo_crane.pt"):
+        with pytest.raises(SystemExit, match="is no curve"):
+            plot_curves.main((ROOT / path,), tmp_path / "mine.svg")
     with pytest.raises(SystemExit, match="must end in .svg"):
         plot_curves.main((tmp_path,), tmp_path / "mine.txt")
     assert not (tmp_path / "mine.svg").exists()
+
+
+def test_level_curves_leave_out_what_is_missing(tmp_path):
+    runs = plot_curves.read("levels")
+    del runs["trpo_crane_randomized"]
+    plot_curves.level_curves(runs, tmp_path / "levels.svg")
+    first = (tmp_path / "levels.svg").read_bytes()
+    plot_curves.level_curves(runs, tmp_path / "levels.svg")
+    assert (tmp_path / "levels.svg").read_bytes() == first
+    plot_curves.level_curves(plot_curves.read("levels"), tmp_path / "levels.svg")
+    assert (tmp_path / "levels.svg").read_bytes() != first
