@@ -197,6 +197,7 @@ def main(runs: Positional[tuple[Path, ...]] = (), figure: Path = Path("curves.sv
         return
     if not (curves := read("curves")):
         sys.exit("benchmark/curves has no CSV: benchmark/make_runs.py curves makes them")
+    curves = {name: curves[name] for name in LABELS if name in curves}  # colours as in levels
     learning_curves(curves, FIGURES / "learning_curves.svg")
     level_curves(read("levels"), FIGURES / "level_curves.svg")
     ablations(read("ablations"), FIGURES / "ablations.svg")
