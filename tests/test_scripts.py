@@ -316,7 +316,8 @@ def test_any_box_task(tmp_path, run_here, capsys, algorithm):
     assert values["charts/episodic_length"] == [200.0]  # all end in the 13th rollout
     assert -1700 * 1.6 < values["eval/episodic_return"][0] < 0
     score = values["final/episodic_return"][0]
-    assert f"final/episodic_return: {score:.3f}" in capsys.readouterr().out
+    (printed,) = re.findall("final/episodic_return: (.+)", capsys.readouterr().out)
+    assert float(printed) == pytest.approx(score, abs=1e-3)  # TensorBoard has 32 bits
     policy = torch.load(only_run(tmp_path) / "policy.pt", weights_only=True)
     assert policy["task"] == {"env_id": "Pendulum-v1"}
     # the rollout stored what the environment gave: cos, sin and a velocity of up to 8
