@@ -118,7 +118,7 @@ def evaluate(name: str, seed: int, run: Path) -> None:
         command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(run)]
         command += ["--json", "--seed", "60000", "--pose-noise", noise]
         result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
-        row = {"run": name, "seed": str(seed), "pose_noise": noise, "trial_seed": "60000"}
+        row = {"run": name, "seed": str(seed), "pose_noise": noise, "trial_seed": result["seed"]}
         for cell in result["cells"]:
             row[f"{cell['diameter']} m"] = round(100 * cell["success_rate"], 1)
         for score in ("success", "gentle"):

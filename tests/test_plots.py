@@ -22,7 +22,7 @@ def run_folder(folder: Path, success: list[float]) -> Path:
     return folder
 
 
-def test_runs_of_one_name_are_its_seeds(tmp_path):
+def test_runs_of_one_name_and_task_are_one_curve(tmp_path):
     folders = [
         run_folder(tmp_path / f"Task-v0__mine__{seed}__0_{seed}", [0.25, 0.5 * seed])
         for seed in (1, 2)
