@@ -106,6 +106,7 @@ def read_arguments(algorithm: str, arguments: type, description: str) -> tuple[A
 def share_arguments(algorithm: str, arguments: type, description: str) -> tuple[Any, dict | None]:
     """What rank 0 gets from `read_arguments`, on all ranks. If it exits, the others do so too."""
     one_line_errors()
+    cpu = torch.device("cpu")  # several CPU ranks can then run beside one GPU
     shared: list[Any] = [None]
     if dist.get_rank() == 0:
         try:
@@ -113,9 +114,9 @@ def share_arguments(algorithm: str, arguments: type, description: str) -> tuple[
         except (SystemExit, OSError) as error:
             code = getattr(error, "code", 1)  # 0 or 2 after --help or a wrong argument
             code = code if isinstance(code, int | None) else 1
-            dist.broadcast_object_list([code])
+            dist.broadcast_object_list([code], device=cpu)
             raise
-    dist.broadcast_object_list(shared)
+    dist.broadcast_object_list(shared, device=cpu)
     if not isinstance(shared[0], tuple):  # rank 0 has said why
         raise SystemExit(shared[0])
     return shared[0]

@@ -196,7 +196,7 @@ if __name__ == "__main__":
     if not dist.is_torchelastic_launched():
         crane_runs.read_arguments(ALGORITHM, Args, __doc__)  # --help
         raise SystemExit(f"start it as: torchrun --standalone --nproc-per-node 2 {__file__}")
-    dist.init_process_group()
+    dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
     # also at an early exit, where the threads of the group may abort the rank
     atexit.register(lambda: dist.is_initialized() and dist.destroy_process_group())
     rank, world_size = dist.get_rank(), dist.get_world_size()

@@ -291,6 +291,18 @@ def scaling() -> str:
     )
 
 
+def gpu() -> str:
+    """gpu.csv: seconds of mPPO's trainings with the networks on a GPU and on the CPU."""
+    lines = []
+    for row in rows_of("gpu.csv"):
+        networks = {"cuda": "GPU", "cpu": "CPU"}[row["networks"]]
+        speed = f"{round(float(row['SPS']), -2):,.0f}"
+        seconds = [f"{float(row[name]):.2g}" for name in ("rollout", "update", "physics")]
+        lines.append([f"{int(row['cranes']):,}", networks, speed, *seconds])
+    header = ["cranes", "networks", "decisions per second", "rollout [s]", "update [s]"]
+    return table([*header, "physics [s]"], lines)
+
+
 TABLES = {
     "leaderboard": leaderboard,
     "results": results,
@@ -306,6 +318,7 @@ TABLES = {
     "missed": missed,
     "rivals": rivals,
     "scaling": scaling,
+    "gpu": gpu,
 }
 
 

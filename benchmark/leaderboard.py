@@ -26,6 +26,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_env
+import crane_trials
 
 HERE = Path(__file__).parent
 BOARD = HERE / "leaderboard.csv"
@@ -58,9 +59,9 @@ class Args:
 
 
 def score(policy: str, level: str) -> dict[str, float]:
-    """SCORES in % of 600 trials of seed 60000."""
-    judge = [sys.executable, str(HERE.parent / "eval_crane.py"), "--json", "--seed", "60000"]
-    judge += ["--env-id", LEVELS[level]]
+    """SCORES in % of 600 trials of REPORT_SEED."""
+    judge = [sys.executable, str(HERE.parent / "eval_crane.py"), "--json"]
+    judge += ["--seed", str(crane_trials.REPORT_SEED), "--env-id", LEVELS[level]]
     own = policy == "scripted" or ":" in policy
     judge += ["--policy", policy] if own else [policy]
     scores = {}

@@ -24,10 +24,14 @@ from pathlib import Path
 from subprocess import PIPE
 from typing import Literal
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 import tyro
 from export_curve import export
 from tqdm import tqdm
 from tyro.conf import Positional
+
+from crane_trials import REPORT_SEED
 
 HERE = Path(__file__).parent
 WRITING = threading.Lock()  # of evaluations.csv
@@ -116,7 +120,7 @@ def evaluate(name: str, seed: int, run: Path) -> None:
     path, rows, new = HERE / "evaluations.csv", {}, {}
     for noise in ("none", "step"):
         command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(run)]
-        command += ["--json", "--seed", "60000", "--pose-noise", noise]
+        command += ["--json", "--seed", str(REPORT_SEED), "--pose-noise", noise]
         result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
         row = {"run": name, "seed": str(seed), "pose_noise": noise, "trial_seed": result["seed"]}
         for cell in result["cells"]:

@@ -2,8 +2,8 @@
 
     python benchmark/scaling.py    # some minutes; leave the machine alone meanwhile
 
-Trains a few updates of mppo_beta_torchrun.py with one rank and with two, times the all-reduces
-between two ranks, and writes all to benchmark/scaling.csv. One update of R ranks with n cranes each
+Trains a few updates of mppo_beta_torchrun.py with one rank and with 2, 4, 8, ... ranks, up to one
+on each core. Times the all-reduces between two ranks. One update of R ranks with n cranes each
 takes
 
     t = T (a + b n) + M (c + d B / R) + M (t_gradient(R) + 2 t_scalar(R))
@@ -13,11 +13,13 @@ bytes in a ring of R ranks, which takes
 
     2 (R - 1) latency + 2 (R - 1) / R * s / bandwidth
 
-a, b, c, d are measured with one rank at two sizes. Two ranks are then predicted and compared with
-what they take. For 8, 64 and 512 ranks a common network is assumed.
+a, b, c, d are measured with one rank at two sizes. More ranks are then predicted and compared with
+what they take. For 8, 64 and 512 ranks a common network is assumed. The rows go to
+benchmark/scaling.csv, where they replace those of a machine with as many cores.
 """
 
 import csv
+import os
 import subprocess
 import sys
 import tempfile
@@ -40,7 +42,7 @@ UPDATES = 8  # of each measurement; the first one is left out
 NETWORK = {"latency": 50e-6, "bandwidth": 1.25e9}  # s, bytes/s: assumed for 10 Gbit/s Ethernet
 ALL_REDUCE = """
 import time, torch, torch.distributed as dist
-dist.init_process_group()
+dist.init_process_group("gloo")
 for size in (1, {parameters}):
     x, times = torch.zeros(size), []
     for _ in range(200):
@@ -53,28 +55,31 @@ dist.destroy_process_group()
 """
 
 
-def torchrun(ranks: int, *arguments: str, cwd: str | None = None) -> str:
-    line = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-    line += ["--nproc-per-node", str(ranks), *arguments]
-    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, check=True).stdout
-
-
-def train(ranks: int, cranes: int) -> dict[str, float]:
-    """Median seconds of a rollout and of an update, with `cranes` cranes on each rank."""
-    batch = ranks * cranes * STEPS
+def times(line: list[str], cranes: int, updates: int = UPDATES) -> dict[str, float]:
+    """Median seconds of a rollout and of an update of a training started by `line`."""
+    batch = cranes * STEPS
+    flags = f"--num-envs {cranes} --minibatch-size {batch // MINIBATCHES}".split()
+    flags += f"--total-timesteps {batch * updates} --eval-every 0 --final-trials 0".split()
+    # without an early stop all updates have the same length
+    flags += ["--target-kl", "1000", "--exp-name", "speed"]
     with tempfile.TemporaryDirectory() as folder:
-        arguments = f"--num-envs {ranks * cranes} --minibatch-size {batch // MINIBATCHES}".split()
-        arguments += f"--total-timesteps {batch * UPDATES} --eval-every 0 --final-trials 0".split()
-        # without an early stop all updates have the same length
-        arguments += ["--target-kl", "1000", "--exp-name", "scaling"]
-        torchrun(ranks, str(SCRIPT), *arguments, cwd=folder)
+        run([*line, *flags], folder)
         events = EventAccumulator(str(next(Path(folder, "runs").iterdir())))
         events.Reload()
-    times = {
-        key: float(np.median([e.value for e in events.Scalars(f"time/{key}")[1:]]))
+    seconds = {
+        key: float(np.median([event.value for event in events.Scalars(f"time/{key}")[1:]]))
         for key in ("rollout", "update")
     }
-    return {"ranks": ranks, "cranes": cranes, **times, "SPS": batch / sum(times.values())}
+    return {**seconds, "SPS": batch / sum(seconds.values())}
+
+
+def run(line: list[str], folder: str | None = None) -> str:
+    return subprocess.run(line, cwd=folder, stdout=subprocess.PIPE, text=True, check=True).stdout
+
+
+def torchrun(ranks: int, script: str) -> list[str]:
+    line = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    return [*line, "--nproc-per-node", str(ranks), script]
 
 
 def ring(ranks: int, size: float, latency: float, bandwidth: float) -> float:
@@ -85,8 +90,13 @@ def ring(ranks: int, size: float, latency: float, bandwidth: float) -> float:
 def main() -> None:
     agent = Agent(18, -np.ones(6), np.ones(6), Args())
     parameters = sum(parameter.numel() for parameter in agent.parameters())
-    sizes = [(1, 64), (1, 16), (2, 32), (2, 64)]
-    runs = [train(*size) for size in tqdm(sizes, unit="training")]
+    cores = os.cpu_count() or 1
+    sizes = [(1, 64), (1, 16)]
+    sizes += [(2**k, cranes) for k in range(1, cores.bit_length()) for cranes in (8, 32)]
+    runs = []
+    for ranks, cranes in tqdm(sizes, unit="training"):
+        seconds = times(torchrun(ranks, str(SCRIPT)), ranks * cranes)
+        runs.append({"ranks": ranks, "cranes": cranes, **seconds})
     one, small = runs[0], runs[1]
     b = (one["rollout"] - small["rollout"]) / STEPS / (64 - 16)
     a = one["rollout"] / STEPS - b * 64
@@ -96,7 +106,7 @@ def main() -> None:
     with tempfile.NamedTemporaryFile("w", suffix=".py") as file:
         file.write(ALL_REDUCE.format(parameters=parameters))
         file.flush()
-        scalar, gradient = map(float, torchrun(2, file.name).split())
+        scalar, gradient = map(float, run(torchrun(2, file.name)).split())
     here = {"latency": scalar / 2, "bandwidth": 4 * parameters / (gradient - scalar)}
 
     def predict(ranks: int, cranes: int, network: dict[str, float]) -> dict[str, float]:
@@ -108,7 +118,7 @@ def main() -> None:
         return {"ranks": ranks, "cranes": cranes, "rollout": rollout, "update": update, "SPS": sps}
 
     rows = [{"what": "measured", **run} for run in runs]
-    rows += [{"what": "model, this machine", **predict(2, n, here)} for n in (32, 64)]
+    rows += [{"what": "model, this machine", **predict(*size, here)} for size in sizes[2:]]
     rows += [
         {"what": "model, 10 Gbit/s", **predict(ranks, n, NETWORK)}
         for ranks in (8, 64, 512)
@@ -119,7 +129,11 @@ def main() -> None:
         print("  ".join(f"{key} {value}" for key, value in row.items()))
     print(f"seconds: a {a:.2e}, b {b:.2e}, c {c:.2e}, d {d:.2e}")
     print(f"{4 * parameters} bytes of gradient; all-reduce {gradient:.2e} s, a number {scalar:.2e}")
-    with open(HERE / "scaling.csv", "w", newline="") as file:
+    path = HERE / "scaling.csv"
+    with open(path, newline="") as file:
+        others = [row for row in csv.DictReader(file) if row["cores"] != str(cores)]
+    rows = others + [{"cores": cores, **row} for row in rows]
+    with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
