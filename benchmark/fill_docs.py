@@ -291,6 +291,13 @@ def scaling() -> str:
     )
 
 
+def profiles() -> str:
+    """profiles.csv: shares of a decision, of a physics step and of a training."""
+    rows = rows_of("profiles.csv")
+    lines = [[row["part"], row["what"], f"{100 * float(row['share']):.0f}"] for row in rows]
+    return table(["of", "goes to", "share [%]"], lines)
+
+
 def gpu() -> str:
     """gpu.csv: seconds of mPPO's trainings with the networks on a GPU and on the CPU."""
     lines = []
@@ -317,6 +324,7 @@ TABLES = {
     "speed": speed,
     "missed": missed,
     "rivals": rivals,
+    "profiles": profiles,
     "scaling": scaling,
     "gpu": gpu,
 }
