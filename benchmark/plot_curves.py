@@ -102,11 +102,12 @@ def recorded(run: Run, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw(axis: plt.Axes, runs: list[Run], x: str, y: str, scale: float, **style) -> None:
-    """Mean over the seeds at the points of the first seed, with their range shaded."""
-    points = [recorded(run, x, y) for run in runs]
-    end = min(x[-1] for x, _ in points)
-    xs = np.append(points[0][0][points[0][0] < end], end)
-    ys = np.array([np.interp(xs, *point) for point in points])
+    """Means of x and y over the seeds at the decisions of the first seed; the range of y shaded."""
+    points = [recorded(run, "decisions", y) for run in runs]
+    end = min(decisions[-1] for decisions, _ in points)
+    decisions = np.append(points[0][0][points[0][0] < end], end)
+    ys = np.array([np.interp(decisions, *point) for point in points])
+    xs = np.mean([np.interp(decisions, run["decisions"], run[x]) for run in runs], axis=0)
     axis.plot(xs * scale, ys.mean(0), **style)
     axis.fill_between(xs * scale, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
 
