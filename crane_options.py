@@ -79,24 +79,24 @@ def check(values: Mapping[str, Any], *annotated: Any) -> None:
 class Options(TypedDict, total=False):
     """What can be changed about the task: keywords of `gymnasium.make`, `--env.*` of the scripts.
 
-    In parentheses: the default of ForestryCrane-v0.
+    In parentheses: what ForestryCrane-v0 has. Other tasks of this crane have other values.
     """
 
-    frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (20)
-    actuators: Literal["ideal", "hydraulic"]  # servos, or the machine's own drives (ideal)
-    randomize: Share  # width of the random errors of drives, log and sensors (0.0)
-    sensors: bool  # also observe last command, rates of q5 and q6, oil forces (False)
-    contact: Literal["primitive", "sdf"]  # contact model of jaws and log (primitive)
-    reward: Literal["staged", "paper"]  # staged, or as printed in the paper (staged)
-    speed: Literal["real", "mjcf"]  # joint speed limits (real)
-    offset: Literal["plus", "minus"]  # sign of the diameter's part in Delta_p,z (plus)
-    signed_yaw: bool  # observe the signed angle to the log, not the paper's Delta_psi (True)
-    axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, to its left, up (crane)
-    pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (none)
-    difficulty: Share  # 0: easy starts, 1: the full task (1.0)
-    retry: Share  # largest share of episodes that repeat a failed start (0.0)
-    integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (implicitfast)
-    solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (Newton)
+    frame_skip: Annotated[int, Range(1, 1800)]  # physics steps of 5 ms per decision (task: 20)
+    actuators: Literal["ideal", "hydraulic"]  # servos, or the machine's own drives (task: ideal)
+    randomize: Share  # width of the random errors of drives, log and sensors (task: 0.0)
+    sensors: bool  # also observe last command, rates of q5 and q6, oil forces (task: False)
+    contact: Literal["primitive", "sdf"]  # contact model of jaws and log (task: primitive)
+    reward: Literal["staged", "paper"]  # staged, or as printed in the paper (task: staged)
+    speed: Literal["real", "mjcf"]  # joint speed limits (task: real)
+    offset: Literal["plus", "minus"]  # sign of the diameter's part in Delta_p,z (task: plus)
+    signed_yaw: bool  # observe the signed angle to the log, not the paper's Delta_psi (task: True)
+    axes: Literal["crane", "world"]  # of Delta_p; crane: along the boom, left, up (task: crane)
+    pose_noise: Literal["none", "step", "episode"]  # how often the pose error is drawn (task: none)
+    difficulty: Share  # 0: easy starts, 1: the full task (task: 1.0)
+    retry: Share  # largest share of episodes that repeat a failed start (task: 0.0)
+    integrator: Literal["implicitfast", "implicit", "discrete"]  # MuJoCo's (task: implicitfast)
+    solver: Literal["Newton", "CG"]  # MuJoCo's constraint solver (task: Newton)
 
 
 DEFAULTS = Options(

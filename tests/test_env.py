@@ -91,9 +91,9 @@ def test_the_papers_task_is_as_printed():
 
 
 def test_options_say_their_defaults():
-    """In parentheses at the end of each comment, as --help and the docstring promise."""
+    """As (task: ...) at the end of each comment, as --help and the docstring promise."""
     source = inspect.getsource(Options)
-    said = dict(re.findall(r"^    (\w+): .*#.* \((\S+)\)$", source, flags=re.M))
+    said = dict(re.findall(r"^    (\w+): .*#.* \(task: (\S+)\)$", source, flags=re.M))
     assert said == {name: str(value) for name, value in DEFAULTS.items()}
     assert DEFAULTS.keys() == Options.__annotations__.keys()
     assert CraneVectorEnv(1).options == DEFAULTS
