@@ -271,7 +271,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     if corner is not None:
         corner.close()
     crane.close()
-    print(f"{len(seeds)} trials filmed in {args.video}")
+    print(f"{len(seeds)} trial{'s' * (len(seeds) > 1)} filmed in {args.video}")
 
 
 def frame(crane: CraneVectorEnv, corner: Photographer | None, lines: list) -> Array:
