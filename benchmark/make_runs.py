@@ -3,8 +3,8 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
     python benchmark/make_runs.py levels      # the same on the two harder levels; 12 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
-    python benchmark/make_runs.py timed       # mPPO alone: default and fast by turns, three seeds each,
-                                              # and one seed of each harder level; 1.5 hours
+    python benchmark/make_runs.py timed       # mPPO alone: default and fast by turns, three seeds
+                                              # each, one seed of each harder level; 1.5 hours
 
 Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
 The runs of curves and levels are then judged in 600 trials of seed 60000: evaluations.csv.
