@@ -180,7 +180,6 @@ def timed() -> str:
     lines = []
     for name, runs in read("timed").items():
         level = name.removeprefix("mppo_beta_crane").strip("_") or "ideal"
-        level = level.replace("fast", "ideal, fast")
         for run in runs:
             numbers = [run["decisions"][-1] / 1e6, run["minutes"][-1], kept_after(run)]
             cells = [joined([x], digits) for x, digits in zip(numbers, (2, 1, 1))]

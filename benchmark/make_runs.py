@@ -3,8 +3,8 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
     python benchmark/make_runs.py levels      # the same on the two harder levels; 12 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
-    python benchmark/make_runs.py timed       # mPPO alone: default and fast by turns, three seeds
-                                              # each, one seed of each harder level; 1.5 hours
+    python benchmark/make_runs.py timed       # mPPO, one at a time: three seeds of the ideal level,
+                                              # one of each harder level; 1.5 hours
 
 Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
 The runs of curves and levels are then judged in 600 trials of seed 60000: evaluations.csv.
@@ -59,7 +59,6 @@ LEVELS = {  # flags of each script on the harder levels
         "--num-envs 128 --env.retry 0.5",
     },
 }
-FAST = "--total-timesteps 409600 --num-steps 32 --minibatch-size 512"  # three minutes of mPPO
 SHORT = "--total-timesteps 614400 --eval-every 10".split()
 
 # Script and flags by name. At another decision rate the number of simulation steps, updates and
@@ -161,12 +160,7 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) ->
         ]
     elif what == "timed":
         exact = ["--eval-trials", "100"]
-        fast = [*exact, *FAST.split()]
-        jobs = [
-            (SCRIPTS[0], SCRIPTS[0] + name, seed, flags, 2)
-            for seed in (1, 2, 3)
-            for name, flags in (("_fast", fast), ("", exact))
-        ]
+        jobs = [(SCRIPTS[0], SCRIPTS[0], seed, exact, 2) for seed in (1, 2, 3)]
         jobs += [level_job(SCRIPTS[0], level, 1, exact, 2) for level in LEVELS]
     else:
         jobs = [
