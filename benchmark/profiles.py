@@ -5,8 +5,9 @@
 - env: the engine's share of CraneVectorEnv.step, for 64 cranes under the shipped mPPO policy. The
   rest is Python: poses, rewards, rules, costs.
 - physics: the stages of a physics step for one crane, called one by one in the states that the
-  policy visits, as shares of their sum. Each is the fastest of 20 calls. The time of a call from
-  Python is subtracted: that of mj_flex, which has nothing to do here.
+  policy visits. The shares are those of their sum, without the integration and the sensors. Each
+  time is that of the fastest of 20 calls, without the call from Python (that of mj_flex, which has
+  nothing to do here).
 - torch: the share of matrix products in all torch operations of a short training of PPO.
 
 benchmark/profiles.csv has the results.

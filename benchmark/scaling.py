@@ -130,8 +130,10 @@ def main() -> None:
     print(f"seconds: a {a:.2e}, b {b:.2e}, c {c:.2e}, d {d:.2e}")
     print(f"{4 * parameters} bytes of gradient; all-reduce {gradient:.2e} s, a number {scalar:.2e}")
     path = HERE / "scaling.csv"
-    with open(path, newline="") as file:
-        others = [row for row in csv.DictReader(file) if row["cores"] != str(cores)]
+    others: list[dict[str, str]] = []
+    if path.exists():
+        with open(path, newline="") as file:
+            others = [row for row in csv.DictReader(file) if row["cores"] != str(cores)]
     rows = others + [{"cores": cores, **row} for row in rows]
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])

@@ -1,4 +1,4 @@
-"""benchmark/make_runs.py: which command a run gets, and the rows that judge it."""
+"""benchmark/make_runs.py: how a run begins and goes on, and the rows that judge it."""
 
 import csv
 import json
