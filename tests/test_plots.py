@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from script_runs import ROOT
 from torch.utils.tensorboard import SummaryWriter
@@ -36,6 +37,19 @@ def test_runs_of_one_name_and_task_are_one_curve(tmp_path):
     plot_curves.main((*folders, ours), tmp_path / "mine.svg")
     drawn = (tmp_path / "mine.svg").read_text()
     assert "<!-- mine (Task-v0), 2 runs -->" in drawn and "<!-- PPO, 1 run -->" in drawn
+
+
+def test_a_curve_has_the_mean_minutes_of_its_seeds():
+    """A slow seed counts to its end: the mean does not stop where the fastest seed ends."""
+    decisions, success = np.array([100.0, 200.0]), {1: [0.0, 1.0], 3: [0.0, 0.5]}
+    runs = [
+        {"decisions": decisions, "minutes": k * np.array([1.0, 2.0]), "success": np.array(y)}
+        for k, y in success.items()
+    ]
+    axis = plot_curves.plt.figure().add_subplot()
+    plot_curves.draw(axis, runs, "minutes", "success", 1.0, color="C0")
+    assert axis.lines[0].get_xdata().tolist() == [2, 4]
+    assert axis.lines[0].get_ydata().tolist() == [0, 0.75]
 
 
 def test_what_cannot_be_drawn_is_said_in_a_line(tmp_path):
