@@ -66,7 +66,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.5})
-    """options of the crane; (task: ...) is what ForestryCrane-v0 has where an option is unset"""
+    """options of the crane; the task sets what you leave out; (task: ...) is ForestryCrane-v0's"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm

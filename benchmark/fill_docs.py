@@ -284,8 +284,8 @@ def rivals() -> str:
 
 def scaling() -> str:
     """scaling.csv: what the model predicts from two cores for a network between machines."""
-    rows = [row for row in rows_of("scaling.csv") if row["cores"] == "2"]
-    rows = [row for row in rows if row["what"] == "model, 10 Gbit/s"]
+    wanted = ("2", "model, 10 Gbit/s")
+    rows = [row for row in rows_of("scaling.csv") if (row["cores"], row["what"]) == wanted]
     header = ["ranks, one core each", "cranes on each", "decisions per second"]
     return table(
         header, [[r["ranks"], r["cranes"], f"{round(float(r['SPS']), -2):,.0f}"] for r in rows]
@@ -305,7 +305,7 @@ def gpu() -> str:
     for row in rows_of("gpu.csv"):
         networks = {"cuda": "GPU", "cpu": "CPU"}[row["networks"]]
         speed = f"{round(float(row['SPS']), -2):,.0f}"
-        seconds = [f"{float(row[name]):.2g}" for name in ("rollout", "update", "physics")]
+        seconds = [f"{float(row[name]):.3g}" for name in ("rollout", "update", "physics")]
         lines.append([f"{int(row['cranes']):,}", networks, speed, *seconds])
     header = ["cranes", "networks", "decisions per second", "rollout [s]", "update [s]"]
     return table([*header, "physics [s]"], lines)

@@ -8,7 +8,6 @@ the CPU. The physics has all cores, and so have the updates on the CPU. "physics
 part faster. benchmark/gpu.csv has the results.
 """
 
-import csv
 import os
 import platform
 import sys
@@ -20,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import gymnasium
 import torch
 import tyro
-from scaling import STEPS, times
+from scaling import STEPS, times, write
 from tqdm import tqdm
 
 import crane_runs
@@ -56,10 +55,7 @@ def main() -> None:
         row |= {key: f"{row[key]:.4g}" for key in ("rollout", "update", "SPS", "physics")}
         rows.append(row)
         tqdm.write("  ".join(f"{key} {value}" for key, value in row.items()))
-    with open(HERE / "gpu.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write(rows, HERE / "gpu.csv")
 
 
 if __name__ == "__main__":

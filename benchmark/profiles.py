@@ -2,25 +2,25 @@
 
     python benchmark/profiles.py    # a minute; run nothing else
 
-- env: the engine's share of CraneVectorEnv.step, for 64 cranes under the shipped mPPO policy. The
-  rest is Python: poses, rewards, rules, costs.
-- physics: the stages of a physics step for one crane, called one by one in the states that the
-  policy visits. The shares are those of their sum, without the integration and the sensors. Each
-  time is that of the fastest of 20 calls, without the call from Python (that of mj_flex, which has
-  nothing to do here).
-- torch: the share of matrix products in all torch operations of a short training of PPO.
+- A decision: the engine's share of CraneVectorEnv.step, for 64 cranes under the shipped mPPO
+  policy. The rest is Python: poses, rewards, rules, costs.
+- A physics step: its stages for one crane, called one by one in the states that the policy visits.
+  The shares are those of their sum, without the integration and the sensors. Each time is that of
+  the fastest of 20 calls, without the call from Python. A call of mj_flex shows what that takes,
+  because this function has nothing to do here.
+- Torch in PPO: the share of matrix products in all torch operations of a short training.
 
 benchmark/profiles.csv has the results.
 """
 
 import csv
-import os
 import runpy
 import sys
 import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -129,15 +129,12 @@ def physics_shares() -> Rows:
 def torch_shares() -> Rows:
     """Shares of torch's own time in a training of PPO; the physics is no part of it."""
     arguments = "--total-timesteps 24576 --eval-every 0 --final-trials 0 --torch-threads 1".split()
-    sys.argv, here = ["ppo_crane.py", *arguments], os.getcwd()
-    with tempfile.TemporaryDirectory() as folder, profile() as profiled:
-        os.chdir(folder)
+    sys.argv = ["ppo_crane.py", *arguments]
+    with tempfile.TemporaryDirectory() as folder, chdir(folder), profile() as profiled:
         runpy.run_path(str(ROOT / "ppo_crane.py"), run_name="__main__")
-        os.chdir(here)
-    operations = profiled.key_averages()
-    products = ("aten::addmm", "aten::mm", "aten::linear")
-    spent = sum(entry.self_cpu_time_total for entry in operations if entry.key in products)
-    whole = sum(entry.self_cpu_time_total for entry in operations if "aten::" in entry.key)
+    seconds = {entry.key: entry.self_cpu_time_total for entry in profiled.key_averages()}
+    whole = sum(spent for key, spent in seconds.items() if key.startswith("aten::"))
+    spent = seconds["aten::addmm"] + seconds["aten::mm"]
     return [("torch in PPO", "matrix products", spent / whole)]
 
 

@@ -82,6 +82,13 @@ def torchrun(ranks: int, script: str) -> list[str]:
     return [*line, "--nproc-per-node", str(ranks), script]
 
 
+def write(rows: list[dict], path: Path) -> None:
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def ring(ranks: int, size: float, latency: float, bandwidth: float) -> float:
     """Seconds of an all-reduce of size bytes."""
     return 2 * (ranks - 1) * latency + 2 * (ranks - 1) / ranks * size / bandwidth
@@ -135,10 +142,7 @@ def main() -> None:
         with open(path, newline="") as file:
             others = [row for row in csv.DictReader(file) if row["cores"] != str(cores)]
     rows = others + [{"cores": cores, **row} for row in rows]
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write(rows, path)
 
 
 if __name__ == "__main__":
