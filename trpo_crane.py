@@ -128,12 +128,12 @@ class Agent(nn.Module):
 
     def update_normalizer(self, obs: Tensor) -> None:
         """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
-        obs = obs.double()
-        count = self.obs_count + len(obs)
+        obs, new = obs.double(), len(obs)
+        count = self.obs_count + new
         delta = obs.mean(0) - self.obs_mean
-        spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * len(obs)
-        self.obs_var.copy_((spread + delta**2 * self.obs_count * len(obs) / count) / count)
-        self.obs_mean.add_(delta * len(obs) / count)
+        spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * new
+        self.obs_var.copy_((spread + delta**2 * self.obs_count * new / count) / count)
+        self.obs_mean.add_(delta * new / count)
         self.obs_count.copy_(count)
 
     def normalize(self, obs: Tensor) -> Tensor:
