@@ -2,10 +2,12 @@
 
     python benchmark/leaderboard.py check                       # judge every row again
     python benchmark/leaderboard.py check --method mPPO         # the rows of one method
-    python benchmark/leaderboard.py add --method "My method" --level ideal --policy model.zip
+    python benchmark/leaderboard.py add --method "My method" --level ideal --policy model.zip \
+        --training-seed 2
 
-`add` judges a policy and writes its row to benchmark/leaderboard.csv, in place of its author's own
-row of the same method and level. fill_docs.py then writes the table of docs/compare.md. `check`
+Each training seed has a row of its own. `add` judges a policy and writes its row to
+benchmark/leaderboard.csv, in place of its author's own row of the same method, level and seed.
+fill_docs.py then writes the table of docs/compare.md, with the means over the seeds. `check`
 judges the policies of the rows again. Their paths begin in the current folder. It fails if a score
 differs by more than TOLERANCE: policies of the same weights differ by a trial or two between
 processors, through rounding.
@@ -27,6 +29,7 @@ from tyro.conf import Positional
 
 import crane_env
 import crane_trials
+from crane_options import Seed
 
 HERE = Path(__file__).parent
 BOARD = HERE / "leaderboard.csv"
@@ -36,7 +39,7 @@ LEVELS = {
     "randomized": "ForestryCraneRandomized-v0",
 }
 NOISES = {"exact": "none", "pose_errors": "step"}
-COLUMNS = ["method", "level", "policy", "training", "author", "revision"]
+COLUMNS = ["method", "level", "training_seed", "policy", "training", "author", "revision"]
 SCORES = [f"{what}_{noise}" for noise in NOISES for what in ("success", "gentle")]
 TOLERANCE = 1.0  # percentage points, six trials of 600
 
@@ -49,6 +52,8 @@ class Args:
     """name of the method; check: its rows only"""
     level: Literal["ideal", "hydraulic", "randomized"] | None = None
     """add: level of the new row; check: rows of this level only"""
+    training_seed: Seed = 1
+    """add: seed of the training that made the policy; a method without training has 1"""
     policy: str = ""
     """add: a file as eval_crane.py takes it, scripted, or my_module:MyPolicy"""
     training: str = ""
@@ -86,7 +91,7 @@ def check(rows: list[dict[str, str]], method: str, level: str | None) -> list[st
     if not chosen:
         raise SystemExit(f"the leaderboard has no method {method!r} on {level or 'any level'}")
     for row in tqdm(chosen, unit="row"):
-        lines, of = [], f"{row['method']} on {row['level']}"
+        lines, of = [], f"{row['method']} on {row['level']}, seed {row['training_seed']}"
         if row["revision"] != str(crane_env.REVISION):
             lines.append(f"{of}: revision {row['revision']}, the task has {crane_env.REVISION}")
         try:
@@ -132,14 +137,15 @@ def main() -> None:
         raise SystemExit(f"{len(wrong)} differences" if wrong else 0)
     if not (args.method and args.level and args.policy):
         raise SystemExit("add needs --method, --level and --policy")
-    new = {name: getattr(args, name) for name in COLUMNS[:-1]} | {"revision": crane_env.REVISION}
+    new = {name: str(getattr(args, name)) for name in COLUMNS[:-1]}
+    new["revision"] = crane_env.REVISION
     author = next((row["author"] for row in rows if of_the_same(row, args)), None)
     if author not in (None, args.author):
         of = f"{args.method} on {args.level} is a row of {author!r}"
         raise SystemExit(f"{of}, not of {args.author!r}; choose another --method")
     new |= score(args.policy, args.level)
     rows = read_rows(args.board)  # again: judging takes minutes, and another row may have come
-    same = [row for row in rows if of_the_same(row, args)]
+    same = [row for row in rows if all(row[name] == new[name] for name in COLUMNS[:3])]
     if same:
         print(f"replaced: {same[0]}")
     rows = [row for row in rows if row not in same] + [new]

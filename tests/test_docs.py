@@ -180,12 +180,16 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
     replaced, *_ = capsys.readouterr().out.splitlines()
     assert replaced.startswith("replaced: ") and "'policy': 'model.zip'" in replaced
     call("add", "--method", "mine", "--policy", "model.zip", "--level", "ideal")
+    seed_2 = ("--training-seed", "2")
+    call("add", "--method", "mine", "--policy", "second.zip", "--level", "ideal", *seed_2)
+    assert "replaced" not in capsys.readouterr().out
     with pytest.raises(SystemExit, match="add needs --method, --level and --policy"):
         call("add", "--method", "mine", "--policy", "model.zip")
     rows = list(csv.DictReader(board.open()))
-    assert [(row["level"], row["policy"]) for row in rows] == [
-        ("hydraulic", "better.zip"),
-        ("ideal", "model.zip"),
+    assert [(row["level"], row["training_seed"], row["policy"]) for row in rows] == [
+        ("hydraulic", "1", "better.zip"),
+        ("ideal", "1", "model.zip"),
+        ("ideal", "2", "second.zip"),
     ]
     with pytest.raises(SystemExit) as good:
         call("check", "--method", "mine")
@@ -201,7 +205,7 @@ def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
         call("add", "--method", "mine", "--policy", "other.zip", *theirs)
     board.write_text(board.read_text().replace("93.5", "95.0"))
     capsys.readouterr()
-    with pytest.raises(SystemExit, match="2 differences"):
+    with pytest.raises(SystemExit, match="3 differences"):
         call("check")
     assert "gentle_exact is 93.5 %, the row says 95.0 %" in capsys.readouterr().out
 
@@ -228,7 +232,8 @@ def test_leaderboard_goes_on_after_a_row_that_fails(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(leaderboard, "score", score)
     board = tmp_path / "board.csv"
     row = dict.fromkeys([*leaderboard.COLUMNS, *leaderboard.SCORES], "")
-    row |= {"method": "mine", "level": "ideal", "policy": "gone.zip", "revision": "1"}
+    row |= {"method": "mine", "level": "ideal", "training_seed": "1", "policy": "gone.zip"}
+    row["revision"] = "1"
     others = [row | {name: str(number) for name, number in SCORES.items()}]
     write()
     call("add", "--method", "slow", "--policy", "slow.zip", "--level", "ideal")
@@ -237,8 +242,8 @@ def test_leaderboard_goes_on_after_a_row_that_fails(tmp_path, monkeypatch, capsy
     with pytest.raises(SystemExit, match="4 differences"):
         call("check")
     said = capsys.readouterr().out
-    assert "mine on ideal: gone.zip could not be judged" in said
-    assert "quick on ideal: revision 1, the task has" in said
+    assert "mine on ideal, seed 1: gone.zip could not be judged" in said
+    assert "quick on ideal, seed 1: revision 1, the task has" in said
 
 
 SCORES = {
@@ -247,6 +252,24 @@ SCORES = {
     "success_pose_errors": 96.0,
     "gentle_pose_errors": 92.0,
 }
+
+
+def test_leaderboard_shows_means_over_training_seeds(monkeypatch):
+    row = {"level": "hydraulic", "method": "two", "training_seed": "1", "training": "an hour"}
+    row |= {name: str(number) for name, number in SCORES.items()}
+    one = row | {"level": "hydraulic", "method": "one", "gentle_exact": "95.0"}
+    rows = [
+        row,
+        one,
+        row | {"training_seed": "2", "gentle_exact": "95.5"},
+        row | {"level": "ideal"},
+    ]
+    monkeypatch.setattr(fill_docs, "rows_of", lambda name: rows)
+    assert fill_docs.leaderboard().splitlines()[2:] == [
+        "| ideal | two | 93.5 | 97.0 | 92.0 | 96.0 | 1 | an hour |",
+        "| hydraulic | one | 95.0 | 97.0 | 92.0 | 96.0 | 1 | an hour |",
+        "| hydraulic | two | 94.5 | 97.0 | 92.0 | 96.0 | 2 | an hour |",
+    ]
 
 
 def test_leaderboard_takes_no_policy_that_sees_more(monkeypatch):
