@@ -30,9 +30,9 @@ Observation, float32, `Box` of shape (18,), with sensors (32,):
 | 11    | q4 velocity of each stage                        | m/s   | -10     | 10     |
 | 12    | q7 velocity                                      | rad/s | -10     | 10     |
 | 13    | q8 velocity                                      | rad/s | -10     | 10     |
-| 14    | Delta_p,x, grapple centre to log, see axes       | m     | -20     | 20     |
+| 14    | Delta_p,x, grapple centre to log (option axes)   | m     | -20     | 20     |
 | 15    | Delta_p,y                                        | m     | -20     | 20     |
-| 16    | Delta_p,z, see offset                            | m     | -20     | 20     |
+| 16    | Delta_p,z (option offset)                        | m     | -20     | 20     |
 | 17    | signed angle to the log, 0 aligned, see below    | rad   | -4.7124 | 4.7124 |
 | 18    | last command of q1, fraction of its limit        | 1     | -1      | 1      |
 | 19    | last command of q2                               | 1     | -1      | 1      |

@@ -154,7 +154,7 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
 def fingerprint(agent: nn.Module, obs_dim: int) -> torch.Tensor:
     """Actions (3, 16, act_dim) at three fixed batches of observations, one after the other.
 
-    Two networks that read the same weights in different ways have different fingerprints.
+    Policies of the same weights whose mean actions differ have different fingerprints.
     """
     state, actions = None, []
     for obs in np.random.default_rng(0).standard_normal((3, 16, obs_dim)):
@@ -260,6 +260,8 @@ class Run:
         if self.rank == 0:
             for key, value in report.items():
                 self.writer.add_scalar(key, value, iteration * self.batch_size)
+            if stop or self.stop_signals:
+                self.save(iteration)  # before an evaluation: torchrun kills after 30 s
             if args.eval_every and (iteration % args.eval_every == 0 or last):
                 self.evaluate("eval", args.eval_trials, iteration)
         stopping = bool(self.stop_signals) if stop is None else stop

@@ -41,7 +41,7 @@ def make_envs(
     """N environments of any Gymnasium task, with SAME_STEP autoreset and `info["episode"]`.
 
     env_threads and options are the crane's. Other tasks refuse options. They ignore only retry,
-    which some scripts set by default.
+    which the training scripts set by default.
     """
     if is_crane(env_id):
         envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)

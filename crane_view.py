@@ -45,6 +45,7 @@ UNKNOWN = {  # info that `reset` lacks and `caption` shows
     "time_up": np.array([np.inf]),
     "ground_peak": np.zeros(1),
     "litres": np.zeros(1),
+    "time": np.zeros(1),
 }
 
 
@@ -180,8 +181,8 @@ class Window:
         self.window = None
 
 
-def caption(crane: CraneVectorEnv, info: dict[str, Array], driver: str) -> list[tuple[str, str]]:
-    """What a film and the window say of crane 0 after `advance`, in two columns."""
+def caption(info: dict[str, Array], driver: str) -> list[tuple[str, str]]:
+    """What a film and the window say of the info of a `Trial`, in two columns."""
     ended = info["termination"][0] != "none"
     if ended and not info["success"][0]:
         names = [name for name in crane_task.CONDITIONS if info[name][0]]
@@ -196,7 +197,7 @@ def caption(crane: CraneVectorEnv, info: dict[str, Array], driver: str) -> list[
     return [
         ("log", f"{info['diameter'][0]:.2f} m, {info['log_mass'][0]:.0f} kg"),
         ("driver", driver),
-        ("time", f"{crane.decisions[0] * crane.dt:.1f} s"),
+        ("time", f"{info['time'][0]:.1f} s"),
         ("phase", phase),
         ("on the ground", f"{info['ground_peak'][0] / 1e3:.0f} kN at most"),
         ("oil", f"{info['litres'][0]:.1f} l"),
@@ -229,7 +230,8 @@ class Trial:
         actions, self.state = policy.predict(self.obs, self.state, deterministic=deterministic)
         self.obs, _, terminated, truncated, info = self.crane.advance(actions)
         if not self.ended:
-            self.info, self.ended = info, bool(terminated[0] or truncated[0])
+            self.info = info | {"time": self.crane.decisions * self.crane.dt}  # s
+            self.ended = bool(terminated[0] or truncated[0])
 
 
 def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> None:
@@ -254,7 +256,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
                 return
             filmed -= 1 / FPS
             start = time.time()
-            video.append_data(frame(crane, corner, caption(crane, trial.info, driver)))
+            video.append_data(frame(crane, corner, caption(trial.info, driver)))
             if bar.n == 1:  # the first also compiles the shaders
                 minutes = frames * (time.time() - start) / 60
                 bar.write(f"a film of up to {frames} frames takes {minutes:.1f} minutes at most")
@@ -265,7 +267,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             trial = Trial(crane, seed, diameter)
             while not trial.ended:
                 trial.advance(policy, not args.stochastic)
-            end = frame(crane, corner, caption(crane, trial.info, driver))
+            end = frame(crane, corner, caption(trial.info, driver))
             for _ in range(FPS // 2):  # half a second to read it
                 video.append_data(end)
     if corner is not None:
@@ -326,7 +328,7 @@ def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     def new_trial() -> Trial:
         seed = monte_carlo_trials(args.seed, number + 1, [diameter])[1][-1]
         trial = Trial(crane, seed, diameter)
-        window.text = caption(crane, trial.info, names[0])
+        window.text = caption(trial.info, names[0])
         return trial
 
     def watch(seconds: float) -> None:
@@ -370,7 +372,7 @@ def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             continue
         was_ended = trial.ended
         trial.advance(drivers[names[0]], not args.stochastic)
-        window.text = caption(crane, trial.info, names[0])
+        window.text = caption(trial.info, names[0])
         if trial.ended and not was_ended:
             ended_at = time.time()
     crane.close()

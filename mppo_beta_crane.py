@@ -3,7 +3,8 @@
 The paper's own algorithm (Vu et al., Sec. IV-C). It differs from PPO in two points:
 
 - The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n:
-  no action outside the limits (Chou et al., 2017). Its mean, alpha / (alpha + beta), is evaluated.
+  no action outside the limits (Chou et al., 2017). An evaluation takes the mean a_n,
+  alpha / (alpha + beta).
 - In training each sampled action is perturbed, Eq. (robust ppo): a_n <- clip(a_n + g, 0, 1) with
   g ~ U(-eps, eps). Here eps falls to 0 in the first part of the run.
 
@@ -21,7 +22,8 @@ policy gradient and KL are biased while eps > 0.
 Difficulty, policy width, horizon and step size follow schedules (docs/mppo_beta.md).
 
     python mppo_beta_crane.py  # the crane: minutes on two cores
-    python mppo_beta_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
+    python mppo_beta_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64 \\
+        --eval-every 200
 """
 
 import os
@@ -47,7 +49,7 @@ import crane_trials
 from crane_options import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
 
 ALGORITHM = "mppo_beta"
-A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is infinite at 0 and 1
+A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is -inf at 0 and 1
 LOG_EXCESS_MAX = 5.0  # bound of log(alpha - 1) and log(beta - 1)
 
 
@@ -66,7 +68,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.5})
-    """options of the crane; the task sets what you leave out; (task: ...) is ForestryCrane-v0's"""
+    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
@@ -181,8 +183,8 @@ def compute_gae(
 ) -> Tensor:
     """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
-    No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
-    already added gamma * V(final_obs) to the reward.
+    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
+    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
     """
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)

@@ -35,7 +35,7 @@ import crane_trials
 from crane_options import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
 
 ALGORITHM = "mppo_beta"
-A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is infinite at 0 and 1
+A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is -inf at 0 and 1
 LOG_EXCESS_MAX = 5.0  # bound of log(alpha - 1) and log(beta - 1)
 
 
@@ -54,7 +54,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.5})
-    """options of the crane; the task sets what you leave out; (task: ...) is ForestryCrane-v0's"""
+    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
@@ -170,8 +170,8 @@ def compute_gae(
 ) -> Tensor:
     """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
-    No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
-    already added gamma * V(final_obs) to the reward.
+    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
+    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
     """
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)

@@ -13,10 +13,10 @@ The paper's first baseline (Vu et al., Sec. V-A), after Schulman et al., 2017:
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
 V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. In L, A has mean 0 and deviation 1 in each minibatch.
-Difficulty, policy width, horizon and step size follow schedules (docs/ppo.md).
+Difficulty, policy width, horizon and step size follow schedules (docs/mppo_beta.md).
 
     python ppo_crane.py  # the crane: minutes on two cores
-    python ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
+    python ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64 --eval-every 200
 """
 
 import os
@@ -59,7 +59,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.25})
-    """options of the crane; the task sets what you leave out; (task: ...) is ForestryCrane-v0's"""
+    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
@@ -165,8 +165,8 @@ def compute_gae(
 ) -> Tensor:
     """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
-    No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
-    already added gamma * V(final_obs) to the reward.
+    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
+    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
     """
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)

@@ -10,7 +10,7 @@ the grapple swings. A policy with a memory can infer both:
   the state that its crane had when the rollout began.
 
 Advantages A, returns R, the loss and what the time limit does are those of ppo_crane.py.
-Difficulty, policy width, horizon and step size follow schedules (docs/recurrent_ppo.md).
+Difficulty, policy width, horizon and step size follow schedules (docs/mppo_beta.md).
 
     python recurrent_ppo_crane.py  # the crane: minutes on two cores
     python recurrent_ppo_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9 --log-std-init 0
@@ -50,7 +50,7 @@ class Args:
     seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
     total_timesteps: Count = 1_024_000  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: Annotated[int, Range(1, 256)] = 1  # CPU threads of an update; two are slower
+    torch_threads: Annotated[int, Range(1, 256)] = 1  # CPU threads of an update; two gain nothing
     env_threads: Threads = 2  # CPU threads of the physics, 0 for all cores
     resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 
@@ -58,7 +58,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.0})
-    """options of the crane; the task sets what you leave out; (task: ...) is ForestryCrane-v0's"""
+    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
@@ -177,7 +177,10 @@ class Agent(nn.Module):
     def predict(
         self, obs: np.ndarray, state: State | None = None, deterministic: bool = True
     ) -> tuple[np.ndarray, State]:
-        """Actions (B, act_dim) for raw obs (B, obs_dim), and the state of the memory after them."""
+        """Actions (B, act_dim) for raw obs (B, obs_dim), and the state of the memory after them.
+
+        Where an episode begins, the state must be None, or zeros in the row of its crane.
+        """
         obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
         state = self.initial_state(len(obs)) if state is None else state
         no_starts = torch.zeros(1, len(obs), device=obs.device)
@@ -191,8 +194,8 @@ def compute_gae(
 ) -> Tensor:
     """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
-    No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
-    already added gamma * V(final_obs) to the reward.
+    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
+    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
     """
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)

@@ -3,23 +3,23 @@
 The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 
 - The policy is a ~ N(mu(s), sigma^2) as in PPO. An evaluation takes the mean mu(s).
-- Each rollout allows one step s of the policy. It goes along the natural gradient, so far that the
+- Each rollout allows one step p of the policy. It goes along the natural gradient, so far that the
   mean KL divergence from the old policy stays within delta.
 
-    max g^T s   subject to   1/2 s^T (F + d I) s <= delta         g = grad E[rho A]
-    s = sqrt(2 delta / x^T (F + d I) x) x,   (F + d I) x = g
+    max g^T p   subject to   1/2 p^T (F + d I) p <= delta         g = grad E[rho A]
+    p = sqrt(2 delta / x^T (F + d I) x) x,   (F + d I) x = g
 
   F is the Hessian of the mean KL divergence at the old policy. A few iterations of conjugate
   gradient solve for x roughly, with products F v and without F itself (Schulman et al., App. C.1).
-- A line search over the whole rollout takes the first of s, c s, c^2 s, ... with KL <= delta and a
+- A line search over the whole rollout takes the first of p, c p, c^2 p, ... with KL <= delta and a
   larger E[rho A]. If none qualifies, the policy stays.
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
 Advantages A, returns R and the time limit are as in ppo_crane.py. A is scaled over the rollout.
-Difficulty, policy width, horizon and the critic's step size follow schedules (docs/trpo.md).
+Difficulty, policy width, horizon and the critic's step size follow schedules (docs/mppo_beta.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
-    python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
+    python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64 --eval-every 200
 """
 
 import os
@@ -63,7 +63,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.0})
-    """options of the crane; the task sets what you leave out; (task: ...) is ForestryCrane-v0's"""
+    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
@@ -80,7 +80,7 @@ class Args:
     max_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
     cg_iterations: Times = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
-    fisher_samples: Count = 1024  # decisions of each rollout that F is taken from
+    fisher_samples: Count = 1024  # decisions of each rollout whose F gives the step's direction
     line_search_steps: Times = 10  # largest number of trials of the line search
     line_search_decay: Annotated[float, Range(0.01, 0.99)] = 0.8  # c, factor from trial to trial
     max_grad_norm: Factor = 0.5  # bound of the norm of the critic's gradient
@@ -247,8 +247,8 @@ def compute_gae(
 ) -> Tensor:
     """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
 
-    No bootstrapping across episode ends. Where the time limit cut an episode, the caller has
-    already added gamma * V(final_obs) to the reward.
+    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
+    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
     """
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
@@ -350,7 +350,7 @@ if __name__ == "__main__":
         batch = (b_obs, b_actions, adv, old)
         surrogate, _ = surrogate_and_kl(agent, *batch)
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-        # F of a sample is cheaper and gives a good direction. With its length KL exceeds delta.
+        # F of a sample gives the direction. The length needs F of all: KL would exceed delta.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
         matvec = fisher_product(agent, b_obs[sample], args.cg_damping)
         direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)

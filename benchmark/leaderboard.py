@@ -75,8 +75,8 @@ def score(policy: str, level: str) -> dict[str, float]:
         if ran.returncode:
             raise SystemExit(f"{policy} could not be judged")  # eval_crane.py has said why
         answer = json.loads(ran.stdout.splitlines()[-1])
-        if answer["changed"] and not own:
-            raise SystemExit(f"{policy} needs {answer['changed']}, which {level} does not have")
+        if answer["changed"].get("sensors") and not own:
+            raise SystemExit(f"{policy} needs sensors, which {level} does not have")
         scores[f"success_{name}"] = round(100 * answer["mean_success_rate"], 1)
         scores[f"gentle_{name}"] = round(100 * answer["mean_gentle_rate"], 1)
     return scores

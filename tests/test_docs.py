@@ -23,6 +23,7 @@ import fill_docs  # noqa: E402
 import leaderboard  # noqa: E402
 import make_notebook  # noqa: E402
 
+import crane_env  # noqa: E402
 import eval_crane  # noqa: E402
 
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
@@ -256,6 +257,7 @@ SCORES = {
 
 def test_leaderboard_shows_means_over_training_seeds(monkeypatch):
     row = {"level": "hydraulic", "method": "two", "training_seed": "1", "training": "an hour"}
+    row["revision"] = str(crane_env.REVISION)
     row |= {name: str(number) for name, number in SCORES.items()}
     one = row | {"level": "hydraulic", "method": "one", "gentle_exact": "95.0"}
     rows = [
@@ -264,6 +266,7 @@ def test_leaderboard_shows_means_over_training_seeds(monkeypatch):
         row | {"training_seed": "2", "gentle_exact": "95.5"},
         row | {"level": "ideal"},
     ]
+    rows.append(row | {"revision": "1", "gentle_exact": "1.0"})  # of another task
     monkeypatch.setattr(fill_docs, "rows_of", lambda name: rows)
     assert fill_docs.leaderboard().splitlines()[2:] == [
         "| ideal | two | 93.5 | 97.0 | 92.0 | 96.0 | 1 | an hour |",
@@ -273,11 +276,15 @@ def test_leaderboard_shows_means_over_training_seeds(monkeypatch):
 
 
 def test_leaderboard_takes_no_policy_that_sees_more(monkeypatch):
-    answer = '{"changed": {"sensors": true}, "mean_success_rate": 1, "mean_gentle_rate": 1}'
-    judged = subprocess.CompletedProcess([], 0, stdout=answer)
-    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: judged)
-    with pytest.raises(SystemExit, match="needs {'sensors': True}, which ideal does not have"):
-        leaderboard.score("policy.pt", "ideal")
+    def judge(command, **kwargs):
+        sensors = "true" if "more.pt" in command else "false"
+        answer = f'{{"changed": {{"sensors": {sensors}}}, "mean_success_rate": 1, '
+        return subprocess.CompletedProcess([], 0, stdout=answer + '"mean_gentle_rate": 1}')
+
+    monkeypatch.setattr(subprocess, "run", judge)
+    with pytest.raises(SystemExit, match="more.pt needs sensors, which ideal does not have"):
+        leaderboard.score("more.pt", "ideal")
+    assert leaderboard.score("fewer.pt", "hydraulic")["success_exact"] == 100.0
 
 
 @pytest.mark.slow

@@ -166,7 +166,7 @@ def test_table_of_costs(capsys):
     eval_crane.print_care(records, eval_crane.summarize(records))
     rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if "|" in line]
     interval = "{:5.1f} - {:5.1f}".format(*(100 * x for x in eval_crane.wilson_interval(1, 3)))
-    expected = ["33.3", interval.strip(), *"2.00 0.00 0.10 4.00 0.00 0.00 4.50 0.00 0.00".split()]
+    expected = ["33.3", interval.strip(), *"2 0 0.1 4 0 0 4.5 0 0".split()]
     assert [cell.strip() for cell in rows[2]] == ["0.5", *expected]
     assert [cell.strip() for cell in rows[3]] == ["all", *expected]
 
@@ -249,6 +249,20 @@ def test_task_to_judge_on(capsys):
     paper = "ForestryCranePaper-v0"
     assert options_of(policy="scripted", env_id=paper, signed_yaw=False) == (paper, scripted)
     assert options_of(policy="zero", env_id=paper, contact="sdf") == (paper, {"contact": "sdf"})
+
+
+def test_trials_are_of_the_full_task(tmp_path, run_here):
+    """A task that starts easy is judged as its training judges it."""
+    gymnasium.register(
+        "EasyCrane-v0", vector_entry_point=crane_env.CraneVectorEnv, kwargs={"difficulty": 0.0}
+    )
+    rows = []
+    for env_id in ("EasyCrane-v0", CRANE):
+        words = f"--policy scripted --env-id {env_id} --trials 2 --diameters 0.5 --pose-noise none"
+        run_here(*words.split(), "--csv", str(tmp_path / "trials.csv"))
+        rows.append((tmp_path / "trials.csv").read_text())
+    assert rows[0] == rows[1]
+    del gymnasium.registry["EasyCrane-v0"]
 
 
 def test_options_of_the_training_are_said(run_here, monkeypatch):

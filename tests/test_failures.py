@@ -401,6 +401,27 @@ def test_an_interrupted_evaluation_is_made_on_resume(tmp_path, run_here, monkeyp
     assert len(calls) == 7
 
 
+@pytest.mark.parametrize("algorithm", TWO)
+def test_a_signal_saves_before_an_evaluation(tmp_path, run_here, monkeypatch, algorithm):
+    """What sent the signal may not wait for an evaluation: here it ends in the middle."""
+    report = crane_trials.rollout_report
+
+    def signalled(*args):
+        signal.raise_signal(signal.SIGTERM)
+        return report(*args)
+
+    def killed(*args, **kwargs):
+        raise MemoryError
+
+    monkeypatch.setattr(crane_trials, "rollout_report", signalled)
+    monkeypatch.setattr(crane_trials, "evaluate", killed)
+    arguments = [*small(algorithm), *ECHO, "--eval-every", "1", "--total-timesteps", "1280"]
+    with pytest.raises(MemoryError):
+        run_here(algorithm, *arguments)
+    saved = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)
+    assert saved["iteration"] == 1
+
+
 # ---- signals of the judge
 
 

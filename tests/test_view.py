@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -154,8 +153,12 @@ def test_what_is_shown_is_the_trial_that_is_judged(env_id):
         trial.advance(scripted)
     for name in ("success", "ground_peak", "litres", "swing_peak", "centre_miss"):
         assert trial.info[name][0] == judged[name][0], name
+    assert trial.info["time"][0] == pytest.approx(crane.decisions[0] * 0.1)
     assert np.sum(drawn) == pytest.approx(crane.decisions[0] * 0.1)
     assert len(drawn) == crane.decisions[0] * (5 if crane.hydraulic else 4)
+    ended_at = trial.info["time"][0]
+    trial.advance(scripted)
+    assert trial.info["time"][0] == ended_at  # the clock stands after the end
 
 
 def test_the_next_trial_is_the_judges(monkeypatch):
@@ -193,10 +196,10 @@ def test_the_next_trial_is_the_judges(monkeypatch):
 def test_the_caption_names_the_phase(change, phase):
     info = {"termination": "none", "success": False, "time_up": np.inf, "time_to_reach": np.inf}
     info |= {"clearance": 0.0, "diameter": 0.5, "log_mass": 351.0, "ground_peak": 2e3, "litres": 1}
+    info["time"] = 1.2
     info |= {name: False for name in ("not_reached", "not_lifted", "not_held", "off_centre")}
     info = {name: np.array([value]) for name, value in (info | change).items()}
-    crane = SimpleNamespace(decisions=np.array([12]), dt=0.1)
-    lines = dict(crane_view.caption(crane, info, "mine"))
+    lines = dict(crane_view.caption(info, "mine"))
     assert lines["phase"] == phase and lines["time"] == "1.2 s"
     assert lines["log"] == "0.50 m, 351 kg" and lines["on the ground"] == "2 kN at most"
 
