@@ -191,6 +191,7 @@ def timed() -> str:
             numbers = [run["decisions"][-1] / 1e6, run["minutes"][-1], kept_after(run)]
             cells = [joined([x], digits) for x, digits in zip(numbers, (2, 1, 1))]
             lines.append([level, run["seed"], *cells, f"{100 * run['final_success_rate'][-1]:.1f}"])
+    lines.sort(key=lambda line: LEVELS.index(line[0]))
     header = ["level", "seed", "decisions [million]", "training [min]"]
     return table([*header, "96.3 % kept after [min]", "success at the end [%]"], lines)
 
