@@ -96,6 +96,8 @@ def load_model(
     jaws' meshes as signed distance fields against the log's cylinder (paper, Sec. III-B).
     visual False leaves out what is only drawn: the same motion, sooner.
     """
+    if not MODEL_PATH.is_file():
+        raise FileNotFoundError(f"no {MODEL_PATH}: install with pip install -e, not without -e")
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     spec.option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")

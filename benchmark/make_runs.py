@@ -121,6 +121,7 @@ def evaluate(name: str, seed: int, run: Path) -> None:
     for noise in ("none", "step"):
         command = [sys.executable, str(HERE.parent / "eval_crane.py"), str(run)]
         command += ["--json", "--seed", str(REPORT_SEED), "--pose-noise", noise]
+        command += ["--env-threads", "1"]  # another training has the other core
         result = json.loads(subprocess.run(command, stdout=PIPE, check=True).stdout)
         row = {"run": name, "seed": str(seed), "pose_noise": noise, "trial_seed": result["seed"]}
         for cell in result["cells"]:

@@ -53,7 +53,11 @@ FRAME_SKIP = {"frame_skip_10": 10, "frame_skip_4": 4}  # of runs that do not hav
 
 
 def read_csv(path: Path) -> Run:
-    """The columns of a CSV file of export_curve.py, its simulation steps and minutes."""
+    """The columns of a CSV file of export_curve.py, its simulation steps and minutes.
+
+    An update that took ten times as long as the median counts as the median: the machine was
+    suspended meanwhile.
+    """
     rows = []
     if path.suffix == ".csv":
         with open(path) as file:
@@ -63,7 +67,9 @@ def read_csv(path: Path) -> Run:
     run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
     name = path.stem.partition("_seed")[0]
     run["simulation_steps"] = run["decisions"] * FRAME_SKIP.get(name, 20)
-    run["minutes"] = np.nancumsum(run["rollout_s"] + run["update_s"]) / 60
+    seconds = run["rollout_s"] + run["update_s"]
+    seconds[seconds > 10 * np.nanmedian(seconds)] = np.nanmedian(seconds)
+    run["minutes"] = np.nancumsum(seconds) / 60
     return run
 
 

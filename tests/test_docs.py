@@ -287,7 +287,6 @@ def test_leaderboard_takes_no_policy_that_sees_more(monkeypatch):
     assert leaderboard.score("fewer.pt", "hydraulic")["success_exact"] == 100.0
 
 
-@pytest.mark.slow
 def test_leaderboard_scores_are_the_judges(monkeypatch):
     answers = {"none": (0.912, 0.456), "step": (0.834, 0.278)}  # success, gentle
 

@@ -170,8 +170,9 @@ def begun(algorithm, cwd, *arguments, **how):
     line = command(algorithm, *small(algorithm), *LONG, *arguments)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | how
     process = subprocess.Popen(line, cwd=cwd, env=environment(), **pipes)
+    deadline = time.time() + 120
     while not list(Path(cwd).glob("runs/*/checkpoint.pt")):
-        assert process.poll() is None
+        assert process.poll() is None and time.time() < deadline
         time.sleep(0.05)
     return process, only_run(cwd)
 
