@@ -7,9 +7,9 @@
 The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
 stages). Two passive joints q5, q6 let a rotator q7 hang down with the grapple's two jaws q8.
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
-Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` comes close to the task as printed,
-`ForestryCraneHydraulic-v0` the same crane with drives as measured on the machine, and in
-`ForestryCraneRandomized-v0` each episode draws a machine, a log and sensors with errors.
+Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` comes close to the task as printed.
+`ForestryCraneHydraulic-v0` has drives as measured on the machine. In `ForestryCraneRandomized-v0`
+each episode draws drives, a log and sensor errors.
 Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
 
 Observation, float32, `Box` of shape (18,), with sensors (32,):

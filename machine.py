@@ -1,8 +1,8 @@
 """The machine: the crane's model, and drives as measured on the real one (the jaws' are estimated).
 
-The drives turn oil into motion. A command passes the lag of a valve, the pump, a dead time, and a
-spring. The spring's rest position moves at the speed that is left, and its force is limited. Joints
-are damped.
+A commanded speed passes the lag of a valve, the limit of the pump and a dead time. The resulting
+speed moves the rest position of a spring. The force of the spring is limited and drives a damped
+joint.
 `crane_env` simulates this with actuators="hydraulic". Sources of all numbers: assets/README.md.
 """
 

@@ -1,4 +1,4 @@
-"""A scripted crane: resolved-rate control and four phases, the classical rival of the policies.
+"""A scripted crane: resolved-rate control and four phases, the classical baseline of the policies.
 
 It sees what a policy sees, the 18 numbers of the observation, and learns nothing. It knows the
 crane's lengths and speed limits (assets/README.md) and that Delta_p is 0 where the jaws' tips just
@@ -8,13 +8,13 @@ Frames: K_i = K_{i-1} RotZ(q_i) Trans(a, 0, d) RotX(alpha). A column of the Jaco
 for a joint that turns about the axis z through o, and z for a telescope stage. The passive joints
 q5, q6 are not commanded, but where the grapple hangs plumb, q5 = pi/2 - q2 - q3 and q6 = pi/2:
 the Jacobian J of p_C and yaw by q1 ... q4, q7 is taken with dq5 = -dq2 - dq3 and dq6 = 0.
-Joint rates for a task velocity v = (dx, dy, dz, dyaw) by damped least squares (Nakamura and
-Hanafusa, 1986), J and dq in fractions of the joints' limits, so that fast joints do more:
+Damped least squares (Nakamura and Hanafusa, 1986) turns a task velocity v = (dx, dy, dz, dyaw) into
+joint rates dq. J and dq are fractions of the joints' limits, so fast joints move more:
 
     dq = J^T (J J^T + lambda^2 I)^-1 v
 
-The grapple's place when plumb is led over the log, at the height h above it that the phase asks
-for, and its swing s = p_C - p_plumb is damped by letting the tip follow it:
+The controller moves p_plumb, the grapple's place when plumb, over the log, at the height h that the
+phase asks for. The tip follows the swing s = p_C - p_plumb, which damps it:
 
     v = bound(k_p (Delta_p + s + h)) + k_s s     k_s s horizontal, v's change bounded too
     s'' = -omega^2 s - x''                of the tip at x; with x' = k_s s its damping is k_s s'

@@ -3,8 +3,8 @@
 The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 
 - The policy is a ~ N(mu(s), sigma^2) as in PPO. An evaluation takes the mean mu(s).
-- Each rollout allows one step p of the policy. It goes along the natural gradient, so far that the
-  mean KL divergence from the old policy stays within delta.
+- Each rollout gives one step p of the policy along the natural gradient. Its length keeps the mean
+  KL divergence from the old policy within delta.
 
     max g^T p   subject to   1/2 p^T (F + d I) p <= delta         g = grad E[rho A]
     p = sqrt(2 delta / x^T (F + d I) x) x,   (F + d I) x = g

@@ -69,7 +69,7 @@ def leaderboard() -> str:
         numbers = [f"{mean:.1f}" for mean in means[level, method]]
         lines.append([level, method, *numbers, str(len(rows)), rows[0]["training"]])
     header = ["level", "method", "gentle %", "success %", "gentle, with pose errors"]
-    return table([*header, "success, with pose errors", "seeds", "training"], lines)
+    return table([*header, "success, with pose errors", "number of seeds", "training"], lines)
 
 
 def results() -> str:
@@ -311,7 +311,7 @@ def profiles() -> str:
     """profiles.csv: shares of a decision, of a physics step and of a training."""
     rows = rows_of("profiles.csv")
     lines = [[row["part"], row["what"], f"{100 * float(row['share']):.0f}"] for row in rows]
-    return table(["of", "goes to", "share [%]"], lines)
+    return table(["whole", "part", "share [%]"], lines)
 
 
 def gpu() -> str:

@@ -419,7 +419,7 @@ def results_table(path: Path, budget: float) -> str:
             if float(row["budget"]) == budget:
                 runs[row["rival"], row["setting"]][row["seed"]].append(row)
     times = [budget * fifth / 5 for fifth in range(1, 6)]
-    head = ["rival", "settings", "seeds", "decisions", *(f"{t:.3g} min" for t in times)]
+    head = ["method", "settings", "seeds", "decisions", *(f"{t:.3g} min" for t in times)]
     head += ["lowest", "highest", "gentle"]
     table = [head, ["--"] * len(head)]
     for (rival, setting), seeds in runs.items():
