@@ -2,6 +2,7 @@
 
     python eval_crane.py                              # the shipped mPPO policy, Tables I and II
     python eval_crane.py runs/<run>                   # a policy of this repository's scripts
+    python eval_crane.py runs/*__mine__*/             # several, and their mean
     python eval_crane.py --policy scripted            # no learning, see scripted_crane.py
     python eval_crane.py --video lift.mp4             # or --viewer, in a window
 
@@ -70,8 +71,9 @@ CARE_COLUMNS = [  # of the table of costs: heading, result, factor to the headin
 
 @dataclass
 class Args:
-    path: Annotated[Path, tyro.conf.Positional] = SHIPPED
-    """a run's folder or a policy.pt, a model of Stable-Baselines3 (.zip), or an .onnx file"""
+    path: Annotated[tuple[Path, ...], tyro.conf.Positional] = (SHIPPED,)
+    """a run's folder or a policy.pt, a model of Stable-Baselines3 (.zip), or an .onnx file. Several
+    are judged one after the other, and a table compares them"""
     policy: str = "file"
     """file: the one at PATH; scripted: no learning; zero: never move; random: uniform actions;
     my_module:MyPolicy: your own. MyPolicy()(obs) gives actions (docs/compare.md)"""
@@ -464,10 +466,16 @@ def check_combinations(args: Args) -> None:
         ),
         (not args.diameters, "--diameters needs at least one number"),
         (len({*args.diameters}) < len(args.diameters), "--diameters names a diameter twice"),
-        (not from_file and args.path != SHIPPED, f"PATH {wrong_use}"),
+        (not from_file and args.path != (SHIPPED,), f"PATH {wrong_use}"),
+        (not args.path, "PATH is empty; name a policy"),
+        (len({*args.path}) < len(args.path), "PATH names a policy twice"),
+        (
+            len(args.path) > 1 and (args.csv or args.video or args.viewer),
+            "--csv, --video and --viewer take one policy",
+        ),
         (not from_file and args.stochastic, f"--stochastic {wrong_use}"),
         (
-            args.stochastic and args.path.suffix == ".onnx",
+            args.stochastic and any(path.suffix == ".onnx" for path in args.path),
             "--stochastic: an .onnx file has the mean action only",
         ),
         (
@@ -503,14 +511,45 @@ def check_combinations(args: Args) -> None:
                 probe.write(b"x")
 
 
+def print_comparison(tables: dict[tuple[str, str], list[dict]]) -> None:
+    """The scores of several policies, by policy and pose noise, and their means."""
+    rates = {"success": {}, "gentle": {}}
+    for key, records in tables.items():
+        for score, of in rates.items():
+            of[key] = 100 * np.mean([r[score] for r in records])
+    print("\n| pose noise | success % | gentle % | policy |")
+    print("|------------|-----------|----------|--------|")
+    for noise in dict.fromkeys(noise for _, noise in tables):
+        keys = [key for key in tables if key[1] == noise]
+        for key in keys:
+            success, gentle = rates["success"][key], rates["gentle"][key]
+            print(f"| {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | {key[0]} |")
+        success, gentle = (np.mean([of[key] for key in keys]) for of in rates.values())
+        print(f"| {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | mean of {len(keys)} |")
+
+
 def main() -> None:
     crane_runs.one_line_errors()
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     check_combinations(args)
+    tables = {}
+    for path in args.path:
+        for noise, records in report(path, args).items():
+            tables[str(path), noise] = records
+    if len(args.path) > 1 and not args.json:
+        print_comparison(tables)
+    print(end="", flush=True)
+
+
+def report(path: Path, args: Args) -> dict[str, list[dict]]:
+    """Judge one policy and print its tables, or show it. The records of its trials by pose noise.
+
+    path has no meaning unless --policy is "file".
+    """
     task = {"env_id": "ForestryCrane-v0"}
     if args.policy == "file":
-        policy, task, name = load_policy(args.path)
-        source = str(args.path)
+        policy, task, name = load_policy(path)
+        source = str(path)
     elif ":" in args.policy:
         policy, name, source = OwnPolicy(args.policy), "mine", args.policy
     else:
@@ -539,14 +578,15 @@ def main() -> None:
     if args.video or args.viewer:
         torch.manual_seed(args.seed)
         options["pose_noise"] = args.pose_noise or "none"
-        return (film if args.video else show)(policy, name, env_id, options, args)
+        (film if args.video else show)(policy, name, env_id, options, args)
+        return {}
 
-    all_records = []
+    all_records, tables = [], {}
     noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
     for noise in noises:
         torch.manual_seed(args.seed)
         options["pose_noise"] = noise
-        records = []
+        tables[noise] = records = []
         try:
             for record in judge(policy, env_id, options, args):
                 records.append(record)
@@ -566,7 +606,7 @@ def main() -> None:
             paper = PAPER.get(noise, {}) if papers_task else {}
             title = TITLES[noise] if papers_task else "Trials"
             print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")
-    print(end="", flush=True)
+    return tables
 
 
 if __name__ == "__main__":

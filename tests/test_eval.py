@@ -155,6 +155,49 @@ def test_the_papers_figures_stand_beside_the_papers_task_only(run_here, tmp_path
     assert "Table I, clean" in table and "| 98 " in table
 
 
+def test_several_policies_are_compared(run_here):
+    paths = [
+        str(eval_crane.SHIPPED.with_name(f"{name}.pt")) for name in ("mppo_beta_crane", "ppo_crane")
+    ]
+    words = [*paths, "--trials", "4", "--diameters", "0.3", "--seed", "60000"]
+    output = run_here(*words).out
+    assert output.count("Table I, clean") == output.count("Table II, pose noise") == 2
+    table = output[output.index("| pose noise |") :]
+    for noise in ("none", "step"):
+        scores = [
+            json.loads(line)
+            for line in run_here(*words, "--json", "--pose-noise", noise).out.splitlines()
+        ]
+        assert [score["policy"] for score in scores] == paths
+        rows = [
+            line.split("|")[2:5] for line in table.splitlines() if line.startswith(f"| {noise}")
+        ]
+        rows = [[cell.strip() for cell in row] for row in rows]
+        success, gentle = (
+            [100 * s[f"mean_{which}_rate"] for s in scores] for which in ("success", "gentle")
+        )
+        for row, path, *of in zip(rows, paths, success, gentle):
+            assert row == [*(f"{rate:.1f}" for rate in of), path]
+        assert rows[2] == [f"{np.mean(success):.1f}", f"{np.mean(gentle):.1f}", "mean of 2"]
+
+
+def test_means_over_policies(capsys):
+    good, bad = {"success": True, "gentle": True}, {"success": False, "gentle": False}
+    rough = {"success": True, "gentle": False}
+    tables = {("a", "none"): [good, good], ("a", "step"): [bad, bad]}
+    tables |= {("b", "none"): [rough, bad], ("b", "step"): [rough, rough]}
+    eval_crane.print_comparison(tables)
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[3:]]
+    assert [" ".join(cell.strip() for cell in row) for row in rows] == [
+        "none 100.0 100.0 a",
+        "none 50.0 0.0 b",
+        "none 75.0 50.0 mean of 2",
+        "step 0.0 0.0 a",
+        "step 100.0 0.0 b",
+        "step 50.0 0.0 mean of 2",
+    ]
+
+
 def test_table_of_costs(capsys):
     """Medians and the mean time above 20 kN; of the successes, but for the force on the ground."""
     trial = {name: 0.0 for name in crane_env.CARE} | {"diameter": 0.5, "failure": ""}
@@ -477,6 +520,9 @@ def test_clear_errors(tmp_path, run_here, capsys):
     assert "seed must be a whole number in [0, " in error_of("--seed", "-1")
     assert "env_threads must be a whole number in [0, 256]" in error_of("--env-threads", "-1")
     assert "PATH goes with" in error_of(tmp_path / "junk.pt", "--policy", "zero")
+    assert "PATH names a policy twice" in error_of(eval_crane.SHIPPED, eval_crane.SHIPPED)
+    two = [eval_crane.SHIPPED, eval_crane.SHIPPED.with_name("ppo_crane.pt")]
+    assert "take one policy" in error_of(*two, "--csv", "trials.csv")
     assert "--stochastic goes with" in error_of("--policy", "random", "--stochastic")
     assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
     assert "is no file" in error_of("--csv", tmp_path)
