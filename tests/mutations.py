@@ -330,6 +330,27 @@ MUTATIONS = [
         "if False:",
         "test_scripts -k changed_network",
     ),
+    Mutation(
+        "a stop evaluates before it saves",
+        ("crane_runs.py",),
+        "if stop or self.stop_signals:",
+        "if False:",
+        "test_failures -k saves_before",
+    ),
+    Mutation(
+        "the judge's trials may be easy",
+        ("eval_crane.py",),
+        'options |= {"difficulty": 1.0, "retry": 0.0}',
+        "options |= {}",
+        "test_eval -k full_task",
+    ),
+    Mutation(
+        "logs slip more easily in the same revision",
+        ("assets/crane.xml",),
+        'friction="0.5 0.02 0.005"',
+        'friction="0.45 0.02 0.005"',
+        "test_revision",
+    ),
 ]
 
 
