@@ -67,9 +67,9 @@ def read_csv(path: Path) -> Run:
     run = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
     name = path.stem.partition("_seed")[0]
     run["simulation_steps"] = run["decisions"] * FRAME_SKIP.get(name, 20)
-    seconds = run["rollout_s"] + run["update_s"]
-    seconds[seconds > 10 * np.nanmedian(seconds)] = np.nanmedian(seconds)
-    run["minutes"] = np.nancumsum(seconds) / 60
+    seconds = np.nan_to_num(run["rollout_s"] + run["update_s"])
+    seconds[seconds > 10 * np.median(seconds)] = np.median(seconds)
+    run["minutes"] = np.cumsum(seconds) / 60
     return run
 
 

@@ -52,6 +52,16 @@ def test_a_curve_has_the_mean_minutes_of_its_seeds():
     assert axis.lines[0].get_ydata().tolist() == [0, 0.75]
 
 
+def test_a_pause_is_no_training(tmp_path):
+    """An update of ten minutes among updates of a minute counts as a minute."""
+    rows = [f"{100 * k},{580.0 if k == 3 else 40.0},20.0" for k in range(1, 6)]
+    path = tmp_path / "mine_seed1.csv"
+    path.write_text("\n".join(["decisions,rollout_s,update_s", *rows]))
+    assert plot_curves.read_csv(path)["minutes"].tolist() == [1, 2, 12, 13, 14]
+    path.write_text(path.read_text().replace("580.0", "581.0"))
+    assert plot_curves.read_csv(path)["minutes"].tolist() == [1, 2, 3, 4, 5]
+
+
 def test_what_cannot_be_drawn_is_said_in_a_line(tmp_path):
     (tmp_path / "empty").mkdir()
     run_folder(tmp_path / "new", [])
