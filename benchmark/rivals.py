@@ -412,7 +412,10 @@ def run_all(args: Args) -> None:
 
 
 def results_table(path: Path, budget: float) -> str:
-    """Success in %, mean over the seeds, after fifths of the time; the extremes at the end."""
+    """Success in %, mean over the seeds, after fifths of the time; the extremes at the end.
+
+    The best comes first.
+    """
     runs = defaultdict(lambda: defaultdict(list))
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
@@ -422,7 +425,9 @@ def results_table(path: Path, budget: float) -> str:
     head = ["method", "settings", "seeds", "decisions", *(f"{t:.3g} min" for t in times)]
     head += ["lowest", "highest", "gentle"]
     table = [head, ["--"] * len(head)]
-    for (rival, setting), seeds in runs.items():
+    ends = {run: np.mean([float(r[-1]["success"]) for r in runs[run].values()]) for run in runs}
+    for rival, setting in sorted(runs, key=ends.get, reverse=True):
+        seeds = runs[rival, setting]
         cells, last = [rival, setting, str(len(seeds))], [rows[-1] for rows in seeds.values()]
         cells.append(f"{np.mean([int(row['decisions']) for row in last]):,.0f}")
         for t in times:
