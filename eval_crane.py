@@ -513,19 +513,17 @@ def check_combinations(args: Args) -> None:
 
 def print_comparison(tables: dict[tuple[str, str], list[dict]]) -> None:
     """The scores of several policies, by policy and pose noise, and their means."""
-    rates = {"success": {}, "gentle": {}}
-    for key, records in tables.items():
-        for score, of in rates.items():
-            of[key] = 100 * np.mean([r[score] for r in records])
     print("\n| pose noise | success % | gentle % | policy |")
     print("|------------|-----------|----------|--------|")
     for noise in dict.fromkeys(noise for _, noise in tables):
-        keys = [key for key in tables if key[1] == noise]
-        for key in keys:
-            success, gentle = rates["success"][key], rates["gentle"][key]
-            print(f"| {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | {key[0]} |")
-        success, gentle = (np.mean([of[key] for key in keys]) for of in rates.values())
-        print(f"| {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | mean of {len(keys)} |")
+        scores = {
+            policy: [100 * np.mean([r[score] for r in records]) for score in ("success", "gentle")]
+            for (policy, of), records in tables.items()
+            if of == noise
+        }
+        scores[f"mean of {len(scores)}"] = np.mean([*scores.values()], axis=0)
+        for policy, (success, gentle) in scores.items():
+            print(f"| {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | {policy} |")
 
 
 def main() -> None:
@@ -544,7 +542,7 @@ def main() -> None:
 def report(path: Path, args: Args) -> dict[str, list[dict]]:
     """Judge one policy and print its tables, or show it. The records of its trials by pose noise.
 
-    path has no meaning unless --policy is "file".
+    Without --policy file, path is ignored.
     """
     task = {"env_id": "ForestryCrane-v0"}
     if args.policy == "file":

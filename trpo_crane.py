@@ -350,7 +350,7 @@ if __name__ == "__main__":
         batch = (b_obs, b_actions, adv, old)
         surrogate, _ = surrogate_and_kl(agent, *batch)
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-        # F of a sample gives the direction. The length needs F of all: KL would exceed delta.
+        # F of a sample gives a good direction, but a length with which KL exceeds delta.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
         matvec = fisher_product(agent, b_obs[sample], args.cg_damping)
         direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)

@@ -152,11 +152,8 @@ def append(path: Path, jobs: list[dict], measure: Callable) -> None:
 
 def draw(rows: list[dict[str, str]]) -> None:
     """One panel for each thing that is changed, one line for each method."""
-    rows = [
-        r
-        for r in rows
-        if (r["trial_seed"], r["per_diameter"]) == (str(crane_trials.REPORT_SEED), "25")
-    ]
+    protocol = str(crane_trials.REPORT_SEED), "25"  # trial seed, and trials per log diameter
+    rows = [r for r in rows if (r["trial_seed"], r["per_diameter"]) == protocol]
     figure, panels = plt.subplots(1, len(SWEEPS), figsize=(16, 3.4), sharey=True)
     for what, panel in zip(SWEEPS, panels):
         for method in SWEPT:
