@@ -2,7 +2,7 @@
 
     python eval_crane.py                              # the shipped mPPO policy, Tables I and II
     python eval_crane.py runs/<run>                   # a policy of this repository's scripts
-    python eval_crane.py runs/*__mine__*/             # several, and their mean
+    python eval_crane.py runs/*__mine__*/             # several, and their mean on each task
     python eval_crane.py --policy scripted            # no learning, see scripted_crane.py
     python eval_crane.py --video lift.mp4             # or --viewer, in a window
 
@@ -511,19 +511,20 @@ def check_combinations(args: Args) -> None:
                 probe.write(b"x")
 
 
-def print_comparison(tables: dict[tuple[str, str], list[dict]]) -> None:
-    """The scores of several policies, by policy and pose noise, and their means."""
-    print("\n| pose noise | success % | gentle % | policy |")
-    print("|------------|-----------|----------|--------|")
-    for noise in dict.fromkeys(noise for _, noise in tables):
+def print_comparison(tables: dict[tuple[str, str, str], list[dict]]) -> None:
+    """The scores of several policies, by policy, task and pose noise, and means over policies."""
+    print("\n| task | pose noise | success % | gentle % | policy |")
+    print("|------|------------|-----------|----------|--------|")
+    for task, noise in dict.fromkeys(key[1:] for key in tables):
         scores = {
             policy: [100 * np.mean([r[score] for r in records]) for score in ("success", "gentle")]
-            for (policy, of), records in tables.items()
-            if of == noise
+            for (policy, *of), records in tables.items()
+            if of == [task, noise]
         }
-        scores[f"mean of {len(scores)}"] = np.mean([*scores.values()], axis=0)
+        if len(scores) > 1:
+            scores[f"mean of {len(scores)}"] = np.mean([*scores.values()], axis=0)
         for policy, (success, gentle) in scores.items():
-            print(f"| {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | {policy} |")
+            print(f"| {task} | {noise:<10} | {success:<9.1f} | {gentle:<8.1f} | {policy} |")
 
 
 def main() -> None:
@@ -532,17 +533,18 @@ def main() -> None:
     check_combinations(args)
     tables = {}
     for path in args.path:
-        for noise, records in report(path, args).items():
-            tables[str(path), noise] = records
+        for (env_id, noise), records in report(path, args).items():
+            tables[str(path), env_id, noise] = records
     if len(args.path) > 1 and not args.json:
         print_comparison(tables)
     print(end="", flush=True)
 
 
-def report(path: Path, args: Args) -> dict[str, list[dict]]:
-    """Judge one policy and print its tables, or show it. The records of its trials by pose noise.
+def report(path: Path, args: Args) -> dict[tuple[str, str], list[dict]]:
+    """Judge one policy and print its tables, or show it.
 
-    Without --policy file, path is ignored.
+    Returns the records of its trials, by task and pose noise. Without --policy file, path is
+    ignored.
     """
     task = {"env_id": "ForestryCrane-v0"}
     if args.policy == "file":
@@ -584,7 +586,7 @@ def report(path: Path, args: Args) -> dict[str, list[dict]]:
     for noise in noises:
         torch.manual_seed(args.seed)
         options["pose_noise"] = noise
-        tables[noise] = records = []
+        tables[env_id, noise] = records = []
         try:
             for record in judge(policy, env_id, options, args):
                 records.append(record)

@@ -162,17 +162,15 @@ def test_several_policies_are_compared(run_here):
     words = [*paths, "--trials", "4", "--diameters", "0.3", "--seed", "60000"]
     output = run_here(*words).out
     assert output.count("Table I, clean") == output.count("Table II, pose noise") == 2
-    table = output[output.index("| pose noise |") :]
+    table = output[output.index("| task |") :]
     for noise in ("none", "step"):
         scores = [
             json.loads(line)
             for line in run_here(*words, "--json", "--pose-noise", noise).out.splitlines()
         ]
         assert [score["policy"] for score in scores] == paths
-        rows = [
-            line.split("|")[2:5] for line in table.splitlines() if line.startswith(f"| {noise}")
-        ]
-        rows = [[cell.strip() for cell in row] for row in rows]
+        rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+        rows = [row[2:] for row in rows if row[:2] == [CRANE, noise]]
         success, gentle = (
             [100 * s[f"mean_{which}_rate"] for s in scores] for which in ("success", "gentle")
         )
@@ -182,19 +180,22 @@ def test_several_policies_are_compared(run_here):
 
 
 def test_means_over_policies(capsys):
+    """Only policies on one task have a mean."""
     good, bad = {"success": True, "gentle": True}, {"success": False, "gentle": False}
     rough = {"success": True, "gentle": False}
-    tables = {("a", "none"): [good, good], ("a", "step"): [bad, bad]}
-    tables |= {("b", "none"): [rough, bad], ("b", "step"): [rough, rough]}
+    tables = {("a", "ideal", "none"): [good, good], ("a", "ideal", "step"): [bad, bad]}
+    tables |= {("b", "ideal", "none"): [rough, bad], ("b", "ideal", "step"): [rough, rough]}
+    tables |= {("c", "hydraulic", "none"): [good, rough]}
     eval_crane.print_comparison(tables)
     rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[3:]]
     assert [" ".join(cell.strip() for cell in row) for row in rows] == [
-        "none 100.0 100.0 a",
-        "none 50.0 0.0 b",
-        "none 75.0 50.0 mean of 2",
-        "step 0.0 0.0 a",
-        "step 100.0 0.0 b",
-        "step 50.0 0.0 mean of 2",
+        "ideal none 100.0 100.0 a",
+        "ideal none 50.0 0.0 b",
+        "ideal none 75.0 50.0 mean of 2",
+        "ideal step 0.0 0.0 a",
+        "ideal step 100.0 0.0 b",
+        "ideal step 50.0 0.0 mean of 2",
+        "hydraulic none 100.0 50.0 c",
     ]
 
 
