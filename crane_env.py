@@ -378,7 +378,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """New episodes in cranes `ids`; observations and info of all cranes."""
         for i in ids:
             (start_rng, noise_rng, machine_rng), failures = self.rngs[i], self.failures[i]
-            retry = self.options["retry"] * np.mean(self.recent_success[i] or 0.0)
+            retry = self.options["retry"] * np.mean(self.recent_success[i] or 0.0)  # 0 at first
             if retry and failures and start_rng.random() < retry:
                 self.starts[i] = failures[start_rng.integers(len(failures))]
             else:
@@ -461,7 +461,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0], carried)
 
     def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
-        """Observations (N, 18 or 32), float32, inside their space; what `info` says of them."""
+        """Observations (N, 18 or 32) with sensor errors, float32; info and reward terms without."""
         delta_p, delta_psi, signed_angle = crane_task.relative_pose(state, self.options["offset"])
         d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
         clearance, miss = crane_task.log_clearance(state), crane_task.centre_miss(state)
@@ -480,7 +480,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         angle = signed_angle + self.drawn["yaw_error"]
         if not self.options["signed_yaw"]:
             change = np.abs(np.cos(signed_angle)) - np.abs(np.cos(angle))
-            angle = np.clip(delta_psi + change, 0, 1)
+            angle = np.clip(delta_psi + change, 0, 1)  # now an error of Delta_psi
         if self.options["pose_noise"] != "none":
             now = np.minimum(self.decisions, self.noise.shape[1] - 1)
             epsilon = self.noise[np.arange(len(now)), now]
@@ -539,7 +539,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
             kind = crane_view.Window if self.render_mode == "human" else crane_view.Photographer
             self.viewer = kind(self)
-        return self.viewer and self.viewer.show()
+        return self.viewer.show() if self.viewer else None
 
     def close_extras(self, **kwargs: Any) -> None:
         if self.viewer is not None:
@@ -558,7 +558,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class CraneEnv(gymnasium.Env):
-    """One crane: a thin view of `CraneVectorEnv`, whose arguments it takes except num_envs."""
+    """One crane: a view of `CraneVectorEnv`, without its num_envs and autoreset_mode."""
 
     metadata = CraneVectorEnv.metadata
     __reduce__ = CraneVectorEnv.__reduce__

@@ -43,7 +43,7 @@ class OptionError(ValueError):
 
 
 def check(values: Mapping[str, Any], *annotated: Any) -> None:
-    """ValueError names a value that its annotation does not allow, and what it allows.
+    """OptionError names a value that its annotation does not allow, and what it allows.
 
     annotated: classes or functions. It checks bools, Literals and numbers with a Range, also inside
     a tuple or next to None.

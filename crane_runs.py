@@ -2,7 +2,7 @@
 
 This module has no learning. The training scripts call it in this order: `read_arguments`,
 `Run(...)`, `run.iterations()`, after each update `run.finish_update(...)`, and `run.finish()`.
-eval_crane.py uses `one_line_errors`.
+eval_crane.py and export_onnx.py use `one_line_errors` and `fingerprint`.
 """
 
 import io
@@ -32,10 +32,10 @@ import crane_trials
 from crane_options import DEFAULTS
 
 MAX_BATCH = 2**20  # decisions of a rollout, all in memory
-# What --resume may change. Options in env may be repeated, but not changed.
+# What --resume may change. load_checkpoint compares the options in env one by one.
 CHANGEABLE = {"resume", "total_timesteps", "device", "torch_threads", "env_threads", "env"}
 SHOWN = {"return": "charts/episodic_return", "success": "charts/success_rate", "SPS": "time/SPS"}
-LOCKS: list[FileLock] = []  # of the folders in which this process trains
+LOCKS: list[FileLock] = []  # of this process; kept, because a lock without a reference opens
 
 
 def one_line_errors(hint: str = "") -> None:
@@ -52,7 +52,7 @@ def one_line_errors(hint: str = "") -> None:
         else:
             sys.__excepthook__(kind, error, trace)
         if issubclass(kind, BrokenPipeError):
-            say("", sys.stdout)
+            say("", sys.stdout)  # or Python complains of the closed pipe when it exits
 
     def report_of_thread(args: threading.ExceptHookArgs) -> None:
         # TensorBoard writes in a thread. The main thread meets its error at the next scalar.
@@ -133,8 +133,8 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
         task, written_by = checkpoint["task"], checkpoint["algorithm"]
         revision = task.get("revision", crane_env.REVISION)  # only the crane has one
         if (written_by, revision) != (algorithm, crane_env.REVISION):
-            mend = f"; this is {algorithm}, task revision {crane_env.REVISION}"
-            raise SystemExit(f"--resume: {path} is of {written_by}, task revision {revision}{mend}")
+            hint = f"; this is {algorithm}, task revision {crane_env.REVISION}"
+            raise SystemExit(f"--resume: {path} is of {written_by}, task revision {revision}{hint}")
         if not {"weights", "optimizer", "iteration", "fingerprint"} <= checkpoint.keys():
             raise SystemExit(f"--resume: {path} lacks what a checkpoint has, as a policy.pt does")
         # every option as it was, should a default have changed since
@@ -154,7 +154,7 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
 def fingerprint(agent: nn.Module, obs_dim: int) -> torch.Tensor:
     """Actions (3, 16, act_dim) at three fixed batches of observations, one after the other.
 
-    Policies of the same weights whose mean actions differ have different fingerprints.
+    With the same weights it differs only if the code of the Agent has changed.
     """
     state, actions = None, []
     for obs in np.random.default_rng(0).standard_normal((3, 16, obs_dim)):
@@ -186,9 +186,9 @@ class Run:
     ):
         self.algorithm, self.args, self.rank = algorithm, args, rank
         self.agent, self.optimizer = agent, optimizer
-        actions = envs.single_action_space
+        space = envs.single_action_space
         self.spaces = {"obs_dim": envs.single_observation_space.shape[0]}
-        self.spaces |= {"low": torch.as_tensor(actions.low), "high": torch.as_tensor(actions.high)}
+        self.spaces |= {"low": torch.as_tensor(space.low), "high": torch.as_tensor(space.high)}
         self.batch_size = args.num_envs * args.num_steps
         self.num_iterations = max(1, args.total_timesteps // self.batch_size)
         done = 0 if checkpoint is None else checkpoint["iteration"]
@@ -255,8 +255,8 @@ class Run:
         if wrong or not all(tensor.isfinite().all() for tensor in self.agent.state_dict().values()):
             self.bar.close()
             what = ", ".join(wrong[:2]) or "the weights"
-            mend = "lower --learning-rate (TRPO: --max-kl) or look at the task's rewards"
-            raise SystemExit(f"update {iteration}: {what} not finite; {mend}")
+            hint = "lower --learning-rate (TRPO: --max-kl) or look at the task's rewards"
+            raise SystemExit(f"update {iteration}: {what} not finite; {hint}")
         if self.rank == 0:
             for key, value in report.items():
                 self.writer.add_scalar(key, value, iteration * self.batch_size)
@@ -271,7 +271,7 @@ class Run:
             self.bar.close()
             if self.rank == 0:
                 say(f"stopped after update {iteration}; go on with --resume {self.dir}")
-            raise SystemExit(128 + (self.stop_signals or [signal.SIGTERM])[0])
+            raise SystemExit(128 + (self.stop_signals or [signal.SIGTERM])[0])  # as a shell does
         self.bar.set_postfix({k: f"{report[v]:.3g}" for k, v in SHOWN.items() if v in report})
 
     def evaluate(self, name: str, trials: int, iteration: int) -> dict[str, float]:
@@ -302,7 +302,7 @@ class Run:
             (self.dir / f"{name}.tmp").write_bytes(buffer.getvalue())
             os.replace(self.dir / f"{name}.tmp", self.dir / f"{name}.pt")
         # from now on an error can say how to go on
-        one_line_errors(f"; mend this, then go on with --resume {self.dir}")
+        one_line_errors(f"; fix this, then go on with --resume {self.dir}")
 
     def finish(self) -> None:
         """Final trials, unless they were made already."""

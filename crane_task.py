@@ -1,4 +1,4 @@
-"""The task: starts, observation, reward and rules of N cranes, without the simulator.
+"""The task: starts, relative pose, reward and rules of N cranes, without the simulator.
 
 Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
 Crane: Simulator and Benchmarking". `CraneVectorEnv` in crane_env.py applies what stands here.
@@ -24,7 +24,7 @@ PIVOT_HEIGHT = 0.5  # m, from p_C up to the pivots
 
 TIME_LIMIT = 9.0  # s, of an episode
 REACH_TIME = 6.0  # s, by which the log must have been reached
-REACH_DISTANCE = 0.35  # m, d_combine below which the log is reached
+REACH_DISTANCE = 0.35  # m, d_combine = ||Delta_p|| + 1 m Delta_psi below which the log is reached
 LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre
 LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.005 rad or 0.012 m
 HOLD_TIME = 0.5  # s at the end of an episode in which the log must be held
@@ -99,7 +99,7 @@ def ease_start(
     return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
 
-# ---- observation, reward and rules
+# ---- relative pose, reward and rules
 
 
 class CraneState(NamedTuple):

@@ -40,8 +40,8 @@ def make_envs(
 ) -> gymnasium.vector.VectorEnv:
     """N environments of any Gymnasium task, with SAME_STEP autoreset and `info["episode"]`.
 
-    env_threads and options are the crane's. Other tasks refuse options. They ignore only retry,
-    which the training scripts set by default.
+    env_threads and options are the crane's. Other tasks ignore env_threads, and retry, which the
+    training scripts set. They refuse other options.
     """
     if is_crane(env_id):
         envs = gymnasium.make_vec(env_id, num_envs, env_threads=env_threads, **options)
@@ -67,7 +67,7 @@ def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[
         if recent := [success for outcomes in crane.recent_success for success in outcomes]:
             report["charts/success_rate"] = np.mean(recent)
         report["schedule/difficulty"] = crane.difficulty
-        report |= {f"reward/{term[2:]}": np.mean([info[term] for info in infos]) for term in TERMS}
+        report |= {t.replace("r_", "reward/"): np.mean([info[t] for info in infos]) for t in TERMS}
         if ends:
             report["charts/gentle_rate"] = np.mean([info["gentle"][i] for info, i in ends])
             endings = [info["termination"][i] for info, i in ends]
@@ -105,7 +105,7 @@ def run_trials(
         if first.any():
             info["episodic_return"] = info["episode"]["r"]
             for name in names:
-                results.setdefault(name, np.zeros_like(info[name]))[first] = info[name][first]
+                results[name] = np.where(first, info[name], results.get(name, info[name]))
         ended |= first
     return results
 

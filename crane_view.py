@@ -317,8 +317,8 @@ def show(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     cameras = CAMERAS[first:] + CAMERAS[:first]
     window.help = HELP
     drivers = {driver: policy, "keyboard": Keyboard(window)}
-    task = {name: crane.options[name] for name in ("axes", "offset", "frame_skip")}
-    if task == {"axes": "crane", "offset": "plus", "frame_skip": 20}:  # what it knows
+    known = {"axes": "crane", "offset": "plus", "frame_skip": 20, "speed": "real"}
+    if known.items() <= crane.options.items():
         settings = HYDRAULIC if crane.options["actuators"] == "hydraulic" else IDEAL
         drivers["scripted"] = ScriptedCrane(crane.options["signed_yaw"], settings)
     names, number, diameter = list(drivers), args.trial, args.diameters[0]

@@ -16,7 +16,7 @@ The rest is PPO (Schulman et al., 2017) with generalized advantage estimation:
     KL      = E[rho - 1 - log rho]                    stops the epochs (Schulman, 2020)
 
 Where an episode terminates, V(s_{t+1}) and A_{t+1} are 0. Where the time limit cuts an episode,
-V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. In L, A has mean 0 and deviation 1 in each minibatch.
+V(s_{t+1}) is V(final_obs) and A_{t+1} is 0. In L, A has mean 0 and std 1 in each minibatch.
 The executed action follows the perturbed policy, but rho and KL use the unperturbed Beta. So the
 policy gradient and KL are biased while eps > 0.
 Difficulty, policy width, horizon and step size follow schedules (docs/mppo_beta.md).
@@ -56,7 +56,7 @@ LOG_EXCESS_MAX = 5.0  # bound of log(alpha - 1) and log(beta - 1)
 @dataclass
 class Args:
     # experiment
-    exp_name: str = Path(__file__).stem  # name of the run's folder
+    exp_name: str = Path(__file__).stem  # part of the run's folder name
     seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
     total_timesteps: Count = 1_024_000  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
@@ -68,13 +68,13 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.5})
-    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
+    """options of the crane: those of the task, except retry; (task: x): that of ForestryCrane-v0"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
     num_steps: Size = 64  # decisions per crane and rollout
     hidden_sizes: tuple[Width, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    normalize_obs: bool = True  # scale observations by their running mean and deviation
+    normalize_obs: bool = True  # scale observations by their running mean and std
     learning_rate: Factor = 1e-3  # Adam's step size at the start
     gamma: Share = 0.97  # discount per 0.1 s at the start
     horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
@@ -189,9 +189,9 @@ def compute_gae(
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
-        going_on = 1 - dones[t]
-        delta = rewards[t] + gamma * next_value * going_on - values[t]
-        advantages[t] = next_advantage = delta + gamma * lam * going_on * next_advantage
+        not_done = 1 - dones[t]
+        delta = rewards[t] + gamma * next_value * not_done - values[t]
+        advantages[t] = next_advantage = delta + gamma * lam * not_done * next_advantage
         next_value = values[t]
     return advantages
 

@@ -51,7 +51,7 @@ ALGORITHM = "trpo"
 @dataclass
 class Args:
     # experiment
-    exp_name: str = Path(__file__).stem  # name of the run's folder
+    exp_name: str = Path(__file__).stem  # part of the run's folder name
     seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
     total_timesteps: Count = 1_024_000  # decisions to train for, over all cranes
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
@@ -63,13 +63,13 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.0})
-    """options of the crane; unset: the task's, except retry; (task: x) means ForestryCrane-v0's"""
+    """options of the crane: those of the task, except retry; (task: x): that of ForestryCrane-v0"""
     warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
 
     # algorithm
     num_steps: Size = 64  # decisions per crane and rollout
     hidden_sizes: tuple[Width, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    normalize_obs: bool = True  # scale observations by their running mean and deviation
+    normalize_obs: bool = True  # scale observations by their running mean and std
     learning_rate: Factor = 1e-3  # Adam's step size at the start, for the critic
     gamma: Share = 0.97  # discount per 0.1 s at the start
     horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
@@ -174,7 +174,7 @@ def flat(tensors: Iterable[Tensor]) -> Tensor:
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-def fisher_product(agent: Agent, obs: Tensor, damping: float) -> Callable[[Tensor], Tensor]:
+def fisher_vector_product(agent: Agent, obs: Tensor, damping: float) -> Callable[[Tensor], Tensor]:
     """The function v -> (F + damping I) v, v like the flat `policy_parameters`.
 
     F = E[J^T J / sigma^2] for the weights of mu, with J = d mu / d weights, and 2 for each log
@@ -197,7 +197,7 @@ def fisher_product(agent: Agent, obs: Tensor, damping: float) -> Callable[[Tenso
 def conjugate_gradient(
     matvec: Callable[[Tensor], Tensor], b: Tensor, iterations: int
 ) -> tuple[Tensor, float]:
-    """x with matvec(x) = b for a symmetric positive matrix, and the relative residual."""
+    """Roughly x with matvec(x) = b, for a symmetric positive definite matrix; relative residual."""
     x, residual = torch.zeros_like(b), b.clone()
     direction, residual_sq = b.clone(), b @ b
     for _ in range(iterations):
@@ -253,9 +253,9 @@ def compute_gae(
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
-        going_on = 1 - dones[t]
-        delta = rewards[t] + gamma * next_value * going_on - values[t]
-        advantages[t] = next_advantage = delta + gamma * lam * going_on * next_advantage
+        not_done = 1 - dones[t]
+        delta = rewards[t] + gamma * next_value * not_done - values[t]
+        advantages[t] = next_advantage = delta + gamma * lam * not_done * next_advantage
         next_value = values[t]
     return advantages
 
@@ -352,9 +352,9 @@ if __name__ == "__main__":
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
         # F of a sample gives a good direction, but a length with which KL exceeds delta.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
-        matvec = fisher_product(agent, b_obs[sample], args.cg_damping)
+        matvec = fisher_vector_product(agent, b_obs[sample], args.cg_damping)
         direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
-        curvature = direction @ fisher_product(agent, b_obs, args.cg_damping)(direction)
+        curvature = direction @ fisher_vector_product(agent, b_obs, args.cg_damping)(direction)
         full_step = torch.sqrt(2 * args.max_kl / (curvature + 1e-12)) * direction
         fraction, kl, improvement = line_search(agent, full_step, batch, args)
         step_report = {

@@ -530,6 +530,11 @@ def test_clear_errors(tmp_path, run_here, capsys):
     assert "is no file" in error_of("--csv", "/dev/full")  # renaming would replace it
     slow = error_of("--policy", "scripted", "--env-id", "ForestryCranePaper-v0")
     assert slow == "the scripted crane decides every 0.1 s, not every 0.005 s"
+    gymnasium.register(
+        "FastCrane-v0", vector_entry_point=crane_env.CraneVectorEnv, kwargs={"speed": "mjcf"}
+    )
+    fast = error_of("--policy", "scripted", "--env-id", "FastCrane-v0")
+    assert fast == "the scripted crane knows the speed limits of the real machine only"
 
 
 def test_clear_errors_of_damaged_policies(tmp_path, capsys):
@@ -554,6 +559,11 @@ def test_clear_errors_of_damaged_policies(tmp_path, capsys):
     assert error_of(task=6) == " is no policy.pt of this repository"  # as the first files had it
     pendulum = {"env_id": "Pendulum-v1"}
     assert error_of(task=pendulum) == " was trained on Pendulum-v1, not on the crane"
+    for name in saved:  # each is needed, but for the name of the script and the decisions so far
+        torch.save({key: value for key, value in saved.items() if key != name}, path)
+        if name not in ("script", "global_step"):
+            with pytest.raises(SystemExit, match="policy.pt "):
+                eval_crane.load_policy(path)
     path.write_bytes(b"junk")
     with pytest.raises(SystemExit, match="is no policy.pt of this repository"):
         eval_crane.load_policy(path)

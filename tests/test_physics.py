@@ -114,7 +114,7 @@ def test_tip_position_matches_the_model():
 
 
 def test_jaw_geometry():
-    """Tips level and 2.38 m apart when open, straight down at pi/2, meeting at 1.98 rad."""
+    """Tips level and 2.38 m apart when open, straight down at pi/2, meeting at 1.97 rad."""
     model = machine.load_model()
     data = mujoco.MjData(model)
 

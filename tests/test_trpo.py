@@ -13,7 +13,7 @@ from trpo_crane import (
     Agent,
     Args,
     conjugate_gradient,
-    fisher_product,
+    fisher_vector_product,
     flat,
     line_search,
 )
@@ -40,14 +40,14 @@ def explicit_fisher(agent, obs):
     return torch.stack([flat(row) for row in rows])
 
 
-def test_fisher_product():
+def test_fisher_vector_product():
     agent = make_agent()
     obs = torch.randn(7, 3, dtype=torch.float64)
     fisher = explicit_fisher(agent, obs)
     assert fisher[:-2, :-2].abs().max() > 0.1
     for _ in range(5):
         vector = torch.randn(len(fisher), dtype=torch.float64)
-        product = fisher_product(agent, obs, 0.3)(vector)
+        product = fisher_vector_product(agent, obs, 0.3)(vector)
         torch.testing.assert_close(product, fisher @ vector + 0.3 * vector, rtol=1e-6, atol=1e-6)
 
 
@@ -123,7 +123,7 @@ def test_natural_step_spends_the_divergence_it_is_given():
     batch = make_batch(agent)
     gradient = ascent(agent, batch)
 
-    matvec = fisher_product(agent, batch[0], 1e-6)
+    matvec = fisher_vector_product(agent, batch[0], 1e-6)
     direction, _ = conjugate_gradient(matvec, gradient, 100)
     step = torch.sqrt(2 * 1e-6 / (direction @ matvec(direction))) * direction
     fraction, kl, improvement = line_search(agent, step, batch, Args(max_kl=1.01e-6))

@@ -98,7 +98,7 @@ class FakeWindow:
         self.open = False
 
 
-def look(monkeypatch, plan, holds=None):
+def look(monkeypatch, plan, holds=None, **options):
     """The window after `show` has gone through the plan with a crane that nobody moves."""
     monkeypatch.setattr(crane_env, "HEADLESS", False)
     monkeypatch.setattr(crane_view, "Window", FakeWindow)
@@ -115,7 +115,7 @@ def look(monkeypatch, plan, holds=None):
     monkeypatch.setattr(FakeWindow, "__init__", remember)
     args = eval_crane.Args(policy="zero", diameters=(0.4, 0.5))
     zero = eval_crane.FixedPolicy("zero")
-    crane_view.show(zero, "zero", "ForestryCrane-v0", {}, args)
+    crane_view.show(zero, "zero", "ForestryCrane-v0", options, args)
     return windows[0], slept
 
 
@@ -129,6 +129,12 @@ def test_keys_of_the_window(monkeypatch):
     assert window.seen[8]["log"].startswith("0.40 m") and window.seen[15]["log"].startswith("0.50")
     assert [window.seen[k]["driver"] for k in (35, 48, 85)] == ["zero", "keyboard", "scripted"]
     assert np.median(slept[25:]) > 2 * np.median(slept[:15])
+
+
+@pytest.mark.parametrize("option", [{"speed": "mjcf"}, {"axes": "world"}])
+def test_the_scripted_crane_drives_only_what_it_knows(monkeypatch, option):
+    window, _ = look(monkeypatch, [(10, "TAB"), (20, "TAB"), (40, "ESCAPE")], **option)
+    assert [window.seen[k]["driver"] for k in (5, 15, 30)] == ["zero", "keyboard", "zero"]
 
 
 def test_a_lever_moves_its_joint_until_it_is_let_go(monkeypatch):
