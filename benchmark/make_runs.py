@@ -68,8 +68,8 @@ ABLATIONS = {
     "default": ("mppo_beta_crane", ""),
     "reward_paper": ("mppo_beta_crane", "--env.reward paper"),
     "perturb_none": ("mppo_beta_crane", "--perturbation 0"),
-    # to compare with perturb_none: the same learning rate, as wide at the start and at the end
-    "gaussian": ("ppo_crane", "--learning-rate 1e-3 --narrowing 0.83"),
+    # to compare with perturb_none: as wide at the start and at the end, all else equal
+    "gaussian": ("ppo_crane", "--learning-rate 1e-3 --narrowing 0.83 --env.retry 0.5"),
     "offset_minus": ("mppo_beta_crane", "--env.offset minus"),
     "unsigned_yaw": ("mppo_beta_crane", "--env.no-signed-yaw"),
     "axes_world": ("mppo_beta_crane", "--env.axes world"),
