@@ -43,8 +43,8 @@ ABLATIONS = {  # what they change
     "retry_none": "failed starts not repeated",
     "warm_up_none": "full task from the start",
     # *: earlier settings, without r_ground and with other drives; the last three have no flags
-    "frame_skip_10": "two decisions per 0.1 s *",
-    "frame_skip_4": "five decisions per 0.1 s *",
+    "frame_skip_10": "two decisions per 0.1 s",
+    "frame_skip_4": "five decisions per 0.1 s",
     "perturb_rpo": "mean perturbed instead (RPO) *",
     "no_bootstrap": "no bootstrapping at the time limit *",
     "curriculum": "difficulty rises with success *",
