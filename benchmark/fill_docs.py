@@ -326,6 +326,42 @@ def gpu() -> str:
     return table([*header, "physics [s]"], lines)
 
 
+def outside() -> str:
+    """compare_sb3.csv and pendulum_30_seeds.csv: our returns and those of Stable-Baselines3."""
+    lines = []
+    for name in ("compare_sb3.csv", "pendulum_30_seeds.csv"):
+        returns = defaultdict(list)
+        for row in rows_of(name):
+            run = row["task"], row["algorithm"], row["library"]
+            returns[run].append(float(row["mean_return"]))
+        for task, algorithm in dict.fromkeys(run[:2] for run in returns):
+            count = len(returns[task, algorithm, "ours"])
+            line = [task, plot_curves.LABELS[f"{algorithm}_crane"], str(count)]
+            for library in ("ours", "sb3"):
+                if mine := returns[task, algorithm, library]:
+                    line += [
+                        f"{np.mean(mine):.0f} ± {np.std(mine, ddof=1):.0f}",
+                        f"{min(mine):.0f}",
+                    ]
+                else:
+                    line += ["", ""]
+            lines.append(line)
+    header = ["task", "algorithm", "seeds", "ours", "worst seed"]
+    return table([*header, "Stable-Baselines3", "worst seed"], lines)
+
+
+def memory() -> str:
+    """masked_pendulum.csv: the return at the end of each run."""
+    ends = defaultdict(dict)
+    for row in rows_of("masked_pendulum.csv"):
+        ends[row["algorithm"]][row["seed"]] = float(row["mean_return"])
+    lines = [
+        [plot_curves.LABELS[f"{algorithm}_crane"], joined(of_seed.values(), 0)]
+        for algorithm, of_seed in ends.items()
+    ]
+    return table(["algorithm", "return at the end, seeds 1, 2, 3"], lines)
+
+
 TABLES = {
     "leaderboard": leaderboard,
     "results": results,
@@ -343,6 +379,8 @@ TABLES = {
     "profiles": profiles,
     "scaling": scaling,
     "gpu": gpu,
+    "outside": outside,
+    "memory": memory,
 }
 
 

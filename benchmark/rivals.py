@@ -22,7 +22,7 @@ Each rival has two settings. `published` is what its makers publish for continuo
 mppo_beta_crane.py: starts get harder in the first 0.4 of the time, and some repeat a failure.
 
 mppo_beta_crane.py runs with its defaults, and its time includes its start. Its schedules end after
-1,024,000 decisions, in 8 to 20 minutes on two cores, and the run is cut off at its limit. It saves a
+1,024,000 decisions, in 8 to 20 minutes on two cores. A run that needs longer is cut off. It saves a
 policy every 10 updates, so the judge sees a policy that is a little older than the clock says.
 CleanRL's PPO is not measured, because its package needs a Python older than 3.11.
 """
