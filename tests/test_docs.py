@@ -52,6 +52,24 @@ def test_a_changed_number_is_noticed(monkeypatch):
     assert fill_docs.filled(text) != text and "(1.0–" in fill_docs.filled(text)
 
 
+def test_returns_outside_the_crane(monkeypatch):
+    """Mean, sample deviation and worst of the seeds; of a curve, its last row."""
+    run = {"task": "Echo-v0", "algorithm": "ppo", "seed": "1"}
+    ours, theirs = run | {"library": "ours"}, run | {"library": "sb3"}
+    tables = {
+        "compare_sb3.csv": [ours | {"mean_return": r} for r in ("-5", "-1", "3")],
+        "pendulum_30_seeds.csv": [r | {"mean_return": "7"} for r in (ours, ours, theirs, theirs)],
+        "masked_pendulum.csv": [run | {"mean_return": r} for r in ("-9.4", "-2.4")],
+    }
+    tables["masked_pendulum.csv"].append(run | {"seed": "2", "mean_return": "-3.6"})
+    monkeypatch.setattr(fill_docs, "rows_of", tables.get)
+    assert fill_docs.outside().splitlines()[2:] == [
+        "| Echo-v0 | PPO | 3 | -1 ± 4 | -5 |  |  |",
+        "| Echo-v0 | PPO | 2 | 7 ± 0 | 7 | 7 ± 0 | 7 |",
+    ]
+    assert fill_docs.memory().splitlines()[2:] == ["| PPO | -2, -4 |"]
+
+
 def run_of(success: list[float]) -> dict[str, np.ndarray]:
     """Evaluations after 1, 2 ... minutes and million decisions, with updates between them."""
     times = np.arange(2.0, 2 * len(success) + 2) / 2
