@@ -480,7 +480,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         angle = signed_angle + self.drawn["yaw_error"]
         if not self.options["signed_yaw"]:
             change = np.abs(np.cos(signed_angle)) - np.abs(np.cos(angle))
-            angle = np.clip(delta_psi + change, 0, 1)  # now an error of Delta_psi
+            angle = np.clip(delta_psi + change, 0, 1)  # Delta_psi with the error of the yaw
         if self.options["pose_noise"] != "none":
             now = np.minimum(self.decisions, self.noise.shape[1] - 1)
             epsilon = self.noise[np.arange(len(now)), now]

@@ -157,7 +157,7 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         algorithm, task = saved["algorithm"], dict(saved["task"])
-        weights, args, written = saved["weights"], dict(saved["args"]), saved["fingerprint"]
+        weights, args, expected = saved["weights"], dict(saved["args"]), saved["fingerprint"]
     except Exception:  # a damaged file raises many kinds
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
     script = script_of(saved, path)
@@ -174,7 +174,7 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
         raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
     actions = crane_runs.fingerprint(agent, obs_dim)
-    if not torch.allclose(actions, written, atol=1e-3):
+    if not torch.allclose(actions, expected, atol=1e-3):
         wrote = f"that of {saved['script']}, which wrote it"
         raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
     return agent, task, algorithm
