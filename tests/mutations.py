@@ -38,16 +38,15 @@ MUTATIONS = [
     Mutation(
         "success counts after an episode's end",
         ("crane_trials.py",),
-        "np.zeros_like(info[name]))[first] = info[name][first]",
-        "np.zeros_like(info[name]))[:] = info[name]",
+        "np.where(first,",
+        "np.where(True,",
         "test_trials",
     ),
     Mutation(
         "returns count after an episode's end",
         ("crane_trials.py",),
-        "np.zeros_like(info[name]))[first] = info[name][first]",
-        "np.zeros_like(info[name]))[mine := first if name != 'episodic_return' else terminated"
-        " | truncated] = info[name][mine]",
+        "np.where(first,",
+        "np.where(first if name != 'episodic_return' else terminated | truncated,",
         "test_trials",
     ),
     Mutation(
@@ -319,7 +318,7 @@ MUTATIONS = [
     Mutation(
         "a changed network is judged as if it were not",
         ("eval_crane.py",),
-        'if not torch.allclose(actions, saved["fingerprint"], atol=1e-3):',
+        "if not torch.allclose(actions, expected, atol=1e-3):",
         "if False:",
         "test_eval -k edited",
     ),
@@ -343,6 +342,27 @@ MUTATIONS = [
         'options |= {"difficulty": 1.0, "retry": 0.0}',
         "options |= {}",
         "test_eval -k full_task",
+    ),
+    Mutation(
+        "the scripted crane is judged at speeds that it does not know",
+        ("eval_crane.py",),
+        'if crane.options["speed"] != "real":',
+        "if False:",
+        "test_eval -k clear_errors",
+    ),
+    Mutation(
+        "the scripted crane drives at speeds that it does not know",
+        ("crane_view.py",),
+        ', "speed": "real"}',
+        "}",
+        "test_view -k drives_only",
+    ),
+    Mutation(
+        "a mean over policies of several tasks",
+        ("eval_crane.py",),
+        "if of == [task, noise]",
+        "if of[1] == noise",
+        "test_eval -k means_over",
     ),
     Mutation(
         "logs slip more easily in the same revision",
