@@ -42,9 +42,9 @@ ABLATIONS = {  # what they change
     "axes_world": "log's place along the world's axes",
     "retry_none": "failed starts not repeated",
     "warm_up_none": "full task from the start",
-    # *: earlier settings, without r_ground and with other drives; the last three have no flags
     "frame_skip_10": "two decisions per 0.1 s",
     "frame_skip_4": "five decisions per 0.1 s",
+    # *: earlier settings, without r_ground and with other drives; their flags are gone
     "perturb_rpo": "mean perturbed instead (RPO) *",
     "no_bootstrap": "no bootstrapping at the time limit *",
     "curriculum": "difficulty rises with success *",
