@@ -126,7 +126,7 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
     """The arguments of a run, with those of the command line, and checkpoint.pt in its folder."""
     path = folder / "checkpoint.pt"
     if not path.is_file():
-        raise SystemExit(f"--resume: there is no {path}")
+        raise SystemExit(f"--resume: there is no {path}; give the folder of a run")
     lock_folder(folder)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)

@@ -245,7 +245,7 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
     how = {"duration": 1000 / FPS, "loop": 0} if gif else {"fps": FPS, "macro_block_size": 2}
     seeds = [monte_carlo_trials(args.seed, args.trial + 1, [d])[1][-1] for d in args.diameters]
     frames = round(crane_task.TIME_LIMIT * FPS) * len(seeds)  # fewer where a trial ends early
-    bar, filmed = tqdm(total=frames, unit="frame", leave=False), 0.0
+    bar, filmed, successes = tqdm(total=frames, unit="frame", leave=False), 0.0, 0
     with whole_file(args.video) as path, bar, imageio.get_writer(path, **how) as video:
 
         def watch(seconds: float) -> None:
@@ -267,13 +267,15 @@ def film(policy: Any, driver: str, env_id: str, options: dict, args: Any) -> Non
             trial = Trial(crane, seed, diameter)
             while not trial.ended:
                 trial.advance(policy, not args.stochastic)
+            successes += bool(trial.info["success"])
             end = frame(crane, corner, caption(trial.info, driver))
             for _ in range(FPS // 2):  # half a second to read it
                 video.append_data(end)
     if corner is not None:
         corner.close()
     crane.close()
-    print(f"{len(seeds)} trial{'s' * (len(seeds) > 1)} filmed in {args.video}")
+    count = f"{len(seeds)} trial{'s' * (len(seeds) > 1)}"
+    print(f"{count} filmed in {args.video}, {successes} succeeded")
 
 
 def frame(crane: CraneVectorEnv, corner: Photographer | None, lines: list) -> Array:

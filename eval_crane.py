@@ -140,7 +140,8 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     The task is `env_id`, `revision` and all options of the environment. A model of
     Stable-Baselines3 does not know its options.
     """
-    runs = sorted(path.glob("*/policy.pt"), key=os.path.getmtime)
+    runs = [*path.glob("*/policy.pt"), *path.parent.glob("*/policy.pt")]
+    runs.sort(key=os.path.getmtime)
     path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
         built_in = str(path) in ("scripted", "zero", "random")
@@ -175,7 +176,9 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
     actions = crane_runs.fingerprint(agent, obs_dim)
     if not torch.allclose(actions, expected, atol=1e-3):
-        wrote = f"that of {saved['script']}, which wrote it"
+        same = Path(script.__file__).name == Path(saved["script"]).name
+        mend = "undo its change or train again" if same else f"copy {saved['script']} here"
+        wrote = f"that of {saved['script']}, which wrote it; {mend}"
         raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
     return agent, task, algorithm
 
@@ -309,6 +312,8 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
         options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}
     elif args.env_id and "sensors" in trained_on:
         envs = make_envs(env_id, 1)
+        if trained_on["env_id"].split(":")[-1] != env_id.split(":")[-1]:
+            print(f"the policy was trained on {trained_on['env_id']}", file=sys.stderr)
         for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed", "sensors"):
             ours, theirs = envs.unwrapped.options[name], trained_on[name]
             if ours != theirs:
@@ -512,7 +517,7 @@ def check_combinations(args: Args) -> None:
 
 
 def print_comparison(tables: dict[tuple[str, str, str], list[dict]]) -> None:
-    """The scores of several policies, by policy, task and pose noise, and means over policies."""
+    """The scores by policy, task and pose noise. Several policies of a task have a mean, too."""
     print("\n| task | pose noise | success % | gentle % | policy |")
     print("|------|------------|-----------|----------|--------|")
     for task, noise in dict.fromkeys(key[1:] for key in tables):
@@ -534,8 +539,9 @@ def main() -> None:
     tables = {}
     for path in args.path:
         for (env_id, noise), records in report(path, args).items():
-            tables[str(path), env_id, noise] = records
-    if len(args.path) > 1 and not args.json:
+            judged = str(path) if args.policy == "file" else args.policy
+            tables[judged, env_id, noise] = records
+    if tables and not args.json:
         print_comparison(tables)
     print(end="", flush=True)
 
@@ -549,7 +555,9 @@ def report(path: Path, args: Args) -> dict[tuple[str, str], list[dict]]:
     task = {"env_id": "ForestryCrane-v0"}
     if args.policy == "file":
         policy, task, name = load_policy(path)
-        source = str(path)
+        source, script = str(path), type(policy).__module__
+        if name in ALGORITHMS and script not in (f"{name}_crane", OnnxPolicy.__module__):
+            name += f" of {script}.py"  # an edited copy
     elif ":" in args.policy:
         policy, name, source = OwnPolicy(args.policy), "mine", args.policy
     else:

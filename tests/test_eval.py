@@ -286,9 +286,12 @@ def test_task_to_judge_on(capsys):
         f"the policy knows {name}" for name in ("axes", "frame_skip", "offset", "signed_yaw")
     ]
     assert "the policy knows axes='world'; ForestryCrane-v0 has 'crane'" in said
-    seeing = {"env_id": CRANE, **crane_options.complete({"sensors": True})}
+    hydraulic = "ForestryCraneHydraulic-v0"
+    seeing = {"env_id": hydraulic, **crane_options.complete({"sensors": True})}
     assert options_of(trained_on=seeing, env_id=CRANE) == (CRANE, {"sensors": True})
-    assert "knows sensors=True; ForestryCrane-v0 has False" in capsys.readouterr().err
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == f"the policy was trained on {hydraulic}"
+    assert said[1] == "the policy knows sensors=True; ForestryCrane-v0 has False"
     scripted = {"axes": "crane", "offset": "plus", "signed_yaw": False}
     paper = "ForestryCranePaper-v0"
     assert options_of(policy="scripted", env_id=paper, signed_yaw=False) == (paper, scripted)
@@ -496,14 +499,14 @@ def test_clear_errors(tmp_path, run_here, capsys):
         box = re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err)
         return " ".join(box.split()) if error.value.code == 2 else str(error.value)
 
-    assert "no file nowhere.pt" in error_of("nowhere.pt")
+    assert "no file nowhere.pt; train one first" in error_of("nowhere.pt")
     assert "no file scripted; --policy scripted" in error_of("scripted")
     for run in ("old", "new"):
         (tmp_path / "runs" / run).mkdir(parents=True)
         (tmp_path / "runs" / run / "policy.pt").touch()
     os.utime(tmp_path / "runs" / "old" / "policy.pt", (0, 0))
     assert f"the newest run there is {tmp_path}/runs/new" in error_of(tmp_path / "runs")
-    assert "train one first" in error_of(tmp_path / "runs" / "typo")
+    assert f"the newest run there is {tmp_path}/runs/new" in error_of(tmp_path / "runs" / "typo")
     assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
     assert "at least one number" in error_of("--diameters")
     assert "names a diameter twice" in error_of("--diameters", "0.5", "0.5")
@@ -584,11 +587,14 @@ def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     agent, _, algorithm = eval_crane.load_policy(path)
     assert isinstance(agent.actor[1], torch.nn.ReLU) and algorithm == "ppo"
-    assert "| 0.8 " in run_here(path, "--trials", "1", "--pose-noise", "none").out
+    printed = run_here(path, "--trials", "1", "--pose-noise", "none").out
+    assert "ppo of my_ppo_crane.py (" in printed and "| 0.8 " in printed
+    copy.write_text(copy.read_text().replace("nn.ReLU()", "nn.SiLU()"))
+    with pytest.raises(SystemExit, match="which wrote it; undo its change or train again"):
+        eval_crane.load_policy(path)
     copy.rename(tmp_path / "gone.py")
-    with pytest.raises(
-        SystemExit, match="/ppo_crane.py acts otherwise than that of my_ppo_crane.py"
-    ):
+    said = "/ppo_crane.py acts otherwise than that of my_ppo_crane.py, .* copy my_ppo_crane.py here"
+    with pytest.raises(SystemExit, match=said):
         eval_crane.load_policy(path)
     torch.save(torch.load(path, weights_only=True) | {"algorithm": "my_ppo"}, path)
     with pytest.raises(SystemExit, match="its script my_ppo_crane.py is not in this folder"):

@@ -584,8 +584,9 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         ("text", "is damaged or not of this script"),
     ]:
         assert error_of("--resume", name) == f"--resume: {name}/checkpoint.pt {reason}"
+    mend = "give the folder of a run"
     for name in ("empty", "nowhere", "text/checkpoint.pt"):
-        assert error_of("--resume", name) == f"--resume: there is no {name}/checkpoint.pt"
+        assert error_of("--resume", name) == f"--resume: there is no {name}/checkpoint.pt; {mend}"
     batches = "num_minibatches" if algorithm == "recurrent_ppo" else "minibatch_size"
     arguments, message = ONE_DECISION[algorithm]
     assert message in error_of(*arguments.split())
