@@ -93,5 +93,5 @@ if __name__ == "__main__":
             rows += [[algorithm, str(seed), step, round(value, 1)] for step, value in curve]
             print(f"{algorithm}, seed {seed}: {curve[-1][1]:.0f} after {curve[-1][0]} decisions")
             with open(RESULTS.with_suffix(".tmp"), "w", newline="") as file:
-                csv.writer(file).writerows([COLUMNS, *rows])
+                csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
             os.replace(RESULTS.with_suffix(".tmp"), RESULTS)

@@ -212,7 +212,9 @@ def main(part: Positional[Literal["steps", "memory", "kills", "arguments"]]) -> 
     found = [(part, *row) for row in PARTS[part]()]
     old = list(csv.reader(open(RESULTS)))[1:] if RESULTS.exists() else []
     with open(RESULTS.with_suffix(".tmp"), "w", newline="") as file:
-        csv.writer(file).writerows([COLUMNS, *(row for row in old if row[0] != part), *found])
+        csv.writer(file, lineterminator="\n").writerows(
+            [COLUMNS, *(row for row in old if row[0] != part), *found]
+        )
     os.replace(RESULTS.with_suffix(".tmp"), RESULTS)
     for row in found:
         print(*row, sep=", ")
