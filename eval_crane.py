@@ -140,15 +140,17 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     The task is `env_id`, `revision` and all options of the environment. A model of
     Stable-Baselines3 does not know its options.
     """
-    runs = [*path.glob("*/policy.pt"), *path.parent.glob("*/policy.pt")]
-    runs.sort(key=os.path.getmtime)
-    path = path / "policy.pt" if path.is_dir() else path
-    if not path.is_file():
-        built_in = str(path) in ("scripted", "zero", "random")
-        hint = f"--policy {path}" if built_in else "train one first, or give a run's policy.pt"
-        if runs:
-            hint = f"the newest run there is {runs[-1].parent}"
-        raise SystemExit(f"no file {path}; {hint}")
+    file = path / "policy.pt" if path.is_dir() else path
+    if not file.is_file():
+        hint = "train one first, or give a run's policy.pt"
+        runs = [run for run in path.glob("*/policy.pt") if run.is_file()]
+        runs = runs or [run for run in path.parent.glob("*/policy.pt") if run.is_file()]
+        if str(path) in ("scripted", "zero", "random"):
+            hint = f"--policy {path}"
+        elif runs:
+            hint = f"the newest run there is {max(runs, key=os.path.getmtime).parent}"
+        raise SystemExit(f"no file {file}; {hint}")
+    path = file
     if path.suffix == ".zip":
         return load_sb3(path), {"env_id": "ForestryCrane-v0"}, "Stable-Baselines3"
     if path.suffix == ".onnx":
@@ -176,10 +178,11 @@ def load_policy(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
     actions = crane_runs.fingerprint(agent, obs_dim)
     if not torch.allclose(actions, expected, atol=1e-3):
-        same = Path(script.__file__).name == Path(saved["script"]).name
-        mend = "undo its change or train again" if same else f"copy {saved['script']} here"
-        wrote = f"that of {saved['script']}, which wrote it; {mend}"
-        raise SystemExit(f"{path}: the Agent of {script.__file__} acts otherwise than {wrote}")
+        wrote, used = Path(saved.get("script", "")).name, Path(script.__file__)
+        mend = f"undo the change of {used.name} or train again"
+        if wrote not in ("", used.name):
+            mend = f"{wrote} wrote it; copy {wrote}, with its Agent, here"
+        raise SystemExit(f"{path}: the Agent of {used} acts otherwise than in the training; {mend}")
     return agent, task, algorithm
 
 
@@ -556,8 +559,9 @@ def report(path: Path, args: Args) -> dict[tuple[str, str], list[dict]]:
     if args.policy == "file":
         policy, task, name = load_policy(path)
         source, script = str(path), type(policy).__module__
-        if name in ALGORITHMS and script not in (f"{name}_crane", OnnxPolicy.__module__):
-            name += f" of {script}.py"  # an edited copy
+        ours = (f"{name}_crane", "mppo_beta_torchrun", OnnxPolicy.__module__)
+        if name in ALGORITHMS and script not in ours:
+            name = f"{script}.py"  # an edited copy
     elif ":" in args.policy:
         policy, name, source = OwnPolicy(args.policy), "mine", args.policy
     else:
