@@ -189,7 +189,7 @@ def test_recipe_of_an_edited_script(tmp_path):
     assert ran.returncode == 0, ran.stderr
     (folder,) = (tmp_path / "runs").iterdir()
     judge[2] = str(folder)
-    assert "mppo_beta (" in run(tmp_path, judge, *QUICK)
+    assert "my_mppo.py (" in run(tmp_path, judge, *QUICK)
 
 
 def test_leaderboard_judges_again(tmp_path, monkeypatch, capsys):
