@@ -600,7 +600,11 @@ def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, mon
     )
     with pytest.raises(SystemExit, match=said):
         eval_crane.load_policy(path)
-    torch.save(torch.load(path, weights_only=True) | {"algorithm": "my_ppo"}, path)
+    saved = torch.load(path, weights_only=True)
+    torch.save({key: value for key, value in saved.items() if key != "script"}, path)
+    with pytest.raises(SystemExit, match="otherwise than in the training; undo the change of ppo_"):
+        eval_crane.load_policy(path)
+    torch.save(saved | {"algorithm": "my_ppo"}, path)
     with pytest.raises(SystemExit, match="its script my_ppo_crane.py is not in this folder"):
         eval_crane.load_policy(path)
 
