@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from torch.distributions import Beta
 from tyro.conf import Positional
 
+import crane_policies
 import crane_runs
-import eval_crane
 from crane_view import whole_file
 
 
@@ -63,7 +63,7 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
     crane_runs.one_line_errors()
     if file.suffix != ".onnx":
         raise SystemExit(f"{file} must end in .onnx")
-    agent, task, algorithm = eval_crane.load_policy(policy)
+    agent, task, name = crane_policies.load_policy(policy)
     if not hasattr(agent, "obs_mean"):
         raise SystemExit(f"{policy} is no policy.pt of this repository's scripts")
     obs = torch.zeros(2, agent.obs_mean.shape[0])
@@ -83,13 +83,13 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
             dynamo=False,
         )
     model = onnx.load_from_string(buffer.getvalue())
-    onnx.helper.set_model_props(model, {"algorithm": algorithm, "task": json.dumps(task)})
+    onnx.helper.set_model_props(model, {"algorithm": name, "task": json.dumps(task)})
     with whole_file(file) as path:
         onnx.save(model, path)
-        exported = crane_runs.fingerprint(eval_crane.OnnxPolicy(path), obs.shape[1])
+        exported = crane_runs.fingerprint(crane_policies.OnnxPolicy(path), obs.shape[1])
         if not torch.allclose(exported, crane_runs.fingerprint(agent, obs.shape[1]), atol=1e-4):
             raise SystemExit(f"{policy}: its Agent has another `predict`; adapt MeanAction")
-    print(f"{algorithm} written to {file}")
+    print(f"{name} written to {file}")
 
 
 if __name__ == "__main__":

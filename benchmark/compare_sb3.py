@@ -35,9 +35,9 @@ import torch
 import tyro
 
 import crane_options
+import crane_policies
 import crane_runs
 import crane_trials
-import eval_crane
 from crane_options import Seed
 
 ROOT = Path(__file__).parent.parent
@@ -137,7 +137,7 @@ def train_ours(task: str, algorithm: str, seed: int) -> Any:
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
         (path,) = Path(folder).glob("runs/*/policy.pt")
         saved = torch.load(path, weights_only=True)
-    script, env = eval_crane.ALGORITHMS[algorithm], gymnasium.make(task)
+    script, env = crane_policies.ALGORITHMS[algorithm], gymnasium.make(task)
     low, high = env.action_space.low, env.action_space.high
     args = script.Args(**saved["args"])
     agent = script.Agent(env.observation_space.shape[0], low, high, args)

@@ -34,6 +34,7 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_options
+import crane_policies
 import crane_runs
 import crane_trials
 import crane_view
@@ -75,9 +76,9 @@ def policy_of(method: str, level: str, seed: int = 1) -> tuple[Any, dict[str, An
     folder, run = ("curves", script) if level == "ideal" else ("levels", f"{script}_{level}")
     if (HERE / folder / f"{run}_seed{seed}.csv").exists():  # finished
         if runs := sorted(HERE.glob(f"runs/*__{folder}_{run}__{seed}__*/policy.pt")):
-            return eval_crane.load_policy(runs[-1])[:2]
+            return crane_policies.load_policy(runs[-1])[:2]
     shipped = POLICIES / f"{script if level == 'ideal' else run}.pt"
-    return eval_crane.load_policy(shipped)[:2] if seed == 1 and shipped.is_file() else None
+    return crane_policies.load_policy(shipped)[:2] if seed == 1 and shipped.is_file() else None
 
 
 def judge(

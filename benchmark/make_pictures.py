@@ -23,6 +23,7 @@ from PIL import Image
 from tqdm import tqdm
 from tyro.conf import Positional
 
+import crane_policies
 import crane_runs
 import crane_trials
 import crane_view
@@ -116,11 +117,11 @@ def failures(policy: Any, task: dict) -> None:
 
 def main(
     what: Positional[Literal["hero", "stills", "failures"]],
-    policy: Positional[Path] = eval_crane.SHIPPED,
+    policy: Positional[Path] = crane_policies.SHIPPED,
 ) -> None:
     """policy: a run's folder or policy.pt."""
     torch.set_num_threads(1)
-    agent, task, _ = eval_crane.load_policy(policy)
+    agent, task, _ = crane_policies.load_policy(policy)
     {"hero": hero, "stills": stills, "failures": failures}[what](agent, task)
 
 

@@ -33,8 +33,8 @@ from plain_crane import PlainCrane
 from torch.profiler import profile
 from tqdm import tqdm
 
+import crane_policies
 import crane_runs
-import eval_crane
 from crane_env import CraneVectorEnv
 
 ROOT = Path(__file__).parent.parent
@@ -69,7 +69,7 @@ Rows = list[tuple[str, str, float]]  # part, what, share in [0, 1]
 
 
 def env_shares() -> Rows:
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     rows = []
     for frame_skip in (20, 1):
         for threads in (1, 2):
@@ -98,7 +98,7 @@ def env_shares() -> Rows:
 
 def physics_shares() -> Rows:
     """Shares of the stages' sum."""
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     crane = PlainCrane()
     everything = {**STAGES, "call": (mujoco.mj_flex,)}
     probe, seconds = mujoco.MjData(crane.model), defaultdict(float)

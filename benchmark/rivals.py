@@ -298,11 +298,11 @@ def train_mppo(_: str, setting: Setting, seed: int, clock: Clock) -> None:
         raise SystemExit("mppo_beta_crane.py failed; run it alone to see why")
     if not copies:
         raise SystemExit("mppo_beta_crane.py has saved no policy in this time; give more --minutes")
-    import eval_crane
+    import crane_policies
 
     for minutes, contents in copies:
         Path("policy.pt").write_bytes(contents)
-        agent = eval_crane.load_policy(Path("policy.pt"))[0]
+        agent = crane_policies.load_policy(Path("policy.pt"))[0]
         clock.act = lambda obs, agent=agent: agent.predict(obs)[0]
         clock.judge(minutes, torch.load("policy.pt", weights_only=True)["global_step"])
 

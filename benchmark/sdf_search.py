@@ -28,6 +28,7 @@ import tyro
 from tyro.conf import Positional
 
 import crane_env
+import crane_policies
 import crane_runs
 import crane_trials
 import eval_crane
@@ -57,10 +58,10 @@ def touches_missed(policy: Any, envs: crane_env.CraneVectorEnv, seeds: list) -> 
     return 1 - float(np.mean(np.array(touching)[:, hanging]))
 
 
-def main(path: Positional[Path] = eval_crane.SHIPPED) -> None:
+def main(path: Positional[Path] = crane_policies.SHIPPED) -> None:
     """path: policy.pt of a run."""
     torch.set_num_threads(1)
-    policy, task, _ = eval_crane.load_policy(path)
+    policy, task, _ = crane_policies.load_policy(path)
     env_id, options = eval_crane.task_of(eval_crane.Args(contact="sdf"), task)
     diameters, seeds = crane_trials.monte_carlo_trials(SEED, TRIALS)
     rows, reference = [], None

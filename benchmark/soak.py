@@ -34,6 +34,7 @@ from tyro.conf import Positional
 
 import crane_env
 import crane_options
+import crane_policies
 import crane_runs
 import eval_crane
 from crane_env import CraneVectorEnv
@@ -53,7 +54,7 @@ def steps() -> list[Row]:
     Half of the cranes follow the shipped policy, with noise, so that logs are gripped and swung
     about. The others get random actions, half of them at full speed.
     """
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     rows = []
     for actuators, contact, amount in (
         ("ideal", "primitive", 10_000_000),

@@ -53,6 +53,7 @@ from plain_crane import PlainCrane, disagreement
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
+import crane_policies
 import crane_runs
 import crane_task
 import eval_crane
@@ -256,7 +257,7 @@ def in_child(function: Callable, *args: Any) -> Any:
 def train_ours(script: str, frame_skip: int, num_steps: int) -> list[Iteration]:
     """Iterations 2 to 4 of one of our scripts."""
     rollout = CRANES * num_steps
-    threads = eval_crane.ALGORITHMS[script].Args().torch_threads
+    threads = crane_policies.ALGORITHMS[script].Args().torch_threads
     flags = {"num-envs": CRANES, "env-threads": THREADS, "torch-threads": threads}
     flags |= {"env.frame-skip": frame_skip, "num-steps": num_steps, "update-epochs": EPOCHS}
     flags |= {"total-timesteps": 4 * rollout, "eval-every": 0, "final-trials": 0}
@@ -403,7 +404,7 @@ def main() -> None:
     if hasattr(os, "sched_setaffinity"):  # Linux: as many cores for everybody
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:THREADS])
     print(machine())
-    policy, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, task, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     _, options = eval_crane.task_of(eval_crane.Args(), task)
     if {"vector", "training"} & set(args.only):
         for skip in (20, 1):

@@ -79,7 +79,7 @@ MUTATIONS = [
     ),
     Mutation(
         "code in a policy or checkpoint runs",
-        ("eval_crane.py", "crane_runs.py"),
+        ("crane_policies.py", "crane_runs.py"),
         "weights_only=True",
         "weights_only=False",
         "test_failures -k code",
@@ -317,7 +317,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a changed network is judged as if it were not",
-        ("eval_crane.py",),
+        ("crane_policies.py",),
         "if not torch.allclose(actions, expected, atol=1e-3):",
         "if False:",
         "test_eval -k edited",

@@ -11,6 +11,7 @@ sys.path.insert(0, str(BENCHMARK))
 
 import plain_crane  # noqa: E402
 
+import crane_policies  # noqa: E402
 import eval_crane  # noqa: E402
 
 # the others need benchmark/requirements.txt, or have no --help
@@ -33,6 +34,6 @@ def test_the_scripts_explain_themselves(script, tmp_path):
 @pytest.mark.parametrize("frame_skip", [20, 1])
 def test_the_plain_crane_is_the_same_task(frame_skip):
     """What throughput.py compares the speed with: to rounding, with contacts and rewards."""
-    policy, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, task, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     _, options = eval_crane.task_of(eval_crane.Args(), task)
     assert max(plain_crane.disagreement(policy, options, frame_skip)) < 1e-3

@@ -24,7 +24,7 @@ import leaderboard  # noqa: E402
 import make_notebook  # noqa: E402
 
 import crane_env  # noqa: E402
-import eval_crane  # noqa: E402
+import crane_policies  # noqa: E402
 
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
 
@@ -167,9 +167,9 @@ def test_recipe_of_a_normalized_model(tmp_path, monkeypatch, capsys):
     (tmp_path / "my_normalized.py").write_text(code)
     obs = cranes.get_original_obs()
     expected = model.predict(cranes.normalize_obs(obs), deterministic=True)[0]
-    actions = eval_crane.OwnPolicy("my_normalized:Normalized").predict(obs, None)[0]
+    actions = crane_policies.OwnPolicy("my_normalized:Normalized").predict(obs, None)[0]
     np.testing.assert_array_equal(actions, expected)
-    bare = eval_crane.load_policy(tmp_path / "sb3_ppo.zip")[0]
+    bare = crane_policies.load_policy(tmp_path / "sb3_ppo.zip")[0]
     assert "was trained with VecNormalize" in capsys.readouterr().err
     assert not np.allclose(bare.predict(obs, deterministic=True)[0], expected)
 
@@ -376,8 +376,8 @@ def make_policy(folder: Path, run_folder: Path):
     here = os.getcwd()
     os.chdir(folder)
     try:
-        import eval_crane
+        import crane_policies
 
-        return eval_crane.load_policy(run_folder)
+        return crane_policies.load_policy(run_folder)
     finally:
         os.chdir(here)

@@ -18,9 +18,9 @@ from gymnasium.wrappers.vector import DictInfoToList, NormalizeObservation, Norm
 
 import crane_env
 import crane_options
+import crane_policies
 import crane_task
 import crane_trials
-import eval_crane
 import machine
 from crane_env import CraneEnv, CraneVectorEnv
 from crane_options import DEFAULTS, Options
@@ -251,7 +251,7 @@ def test_sensors_describe_the_state_after_the_step(frame_skip):
 
 def test_frame_skip_changes_the_decisions_not_the_physics():
     """Same commands at 10, 20, 40 and 200 Hz: the same motion, also with logs in the jaws."""
-    policy, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, task, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     assert task["frame_skip"] == 20
     commands, ends = [], []
     for frame_skip in (20, 10, 5, 1):

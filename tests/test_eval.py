@@ -18,13 +18,15 @@ import torch
 
 import crane_env
 import crane_options
+import crane_policies
 import crane_runs
 import crane_task
 import crane_trials
 import crane_view
 import eval_crane
 import machine
-from eval_crane import Args, FixedPolicy, judge
+from crane_policies import SHIPPED, FixedPolicy
+from eval_crane import Args, judge
 
 ROOT = Path(__file__).parent.parent
 CRANE = "ForestryCrane-v0"
@@ -145,7 +147,7 @@ def test_both_tables_unless_noise_is_given(run_here, tmp_path):
 
 def test_the_papers_figures_stand_beside_the_papers_task_only(run_here, tmp_path):
     """A policy brings its own options: here the machine's drives under the name of the task."""
-    saved = torch.load(eval_crane.SHIPPED.with_stem("ppo_crane_hydraulic"), weights_only=True)
+    saved = torch.load(SHIPPED.with_stem("ppo_crane_hydraulic"), weights_only=True)
     saved["task"]["env_id"] = CRANE
     torch.save(saved, tmp_path / "policy.pt")
     short = ["--trials", "1", "--pose-noise", "none", "--diameters", "0.5"]
@@ -156,9 +158,7 @@ def test_the_papers_figures_stand_beside_the_papers_task_only(run_here, tmp_path
 
 
 def test_several_policies_are_compared(run_here):
-    paths = [
-        str(eval_crane.SHIPPED.with_name(f"{name}.pt")) for name in ("mppo_beta_crane", "ppo_crane")
-    ]
+    paths = [str(SHIPPED.with_name(f"{name}.pt")) for name in ("mppo_beta_crane", "ppo_crane")]
     words = [*paths, "--trials", "4", "--diameters", "0.3", "--seed", "60000"]
     output = run_here(*words).out
     assert output.count("Table I, clean") == output.count("Table II, pose noise") == 2
@@ -215,10 +215,10 @@ def test_table_of_costs(capsys):
     assert [cell.strip() for cell in rows[3]] == ["all", *expected]
 
 
-@pytest.mark.parametrize("algorithm", eval_crane.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", crane_policies.ALGORITHMS)
 def test_shipped_policies_are_of_this_revision(algorithm, capsys):
-    path = eval_crane.SHIPPED.with_name(f"{algorithm}_crane.pt")
-    _, task, name = eval_crane.load_policy(path)
+    path = SHIPPED.with_name(f"{algorithm}_crane.pt")
+    _, task, name = crane_policies.load_policy(path)
     assert name == algorithm and task["env_id"] == CRANE
     assert task["revision"] == crane_env.REVISION and capsys.readouterr().err == ""
     # what a policy is trained on is what is registered, but for its training's own options
@@ -228,7 +228,7 @@ def test_shipped_policies_are_of_this_revision(algorithm, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted(eval_crane.SHIPPED.parent.iterdir()), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(SHIPPED.parent.iterdir()), ids=lambda p: p.stem)
 def test_shipped_policies_lift_logs(path, run_here):
     """Four trials of three diameters each, on the level that the policy was made for."""
     line = ("--json", "--trials", "4", "--diameters", "0.4", "0.5", "0.6", "--seed", "77")
@@ -240,7 +240,7 @@ def test_shipped_policies_lift_logs(path, run_here):
 
 def test_shipped_policy_in_plain_gymnasium():
     """gymnasium.make without any option observes what the policy was trained to observe."""
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(SHIPPED)
     env, wins = gymnasium.make(CRANE), 0
     for seed in range(4):
         obs, _ = env.reset(seed=seed)
@@ -314,7 +314,7 @@ def test_trials_are_of_the_full_task(tmp_path, run_here):
 
 def test_options_of_the_training_are_said(run_here, monkeypatch):
     """A score under other options than the task's own does not stand beside the paper's."""
-    policy, task, name = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, task, name = crane_policies.load_policy(SHIPPED)
     words = "--trials 1 --diameters 0.5 --pose-noise none".split()
     assert "Table I, clean" in run_here(*words).out
     assert json.loads(run_here(*words, "--json").out)["changed"] == {}
@@ -326,7 +326,7 @@ def test_options_of_the_training_are_said(run_here, monkeypatch):
 
 
 def test_the_shipped_policy_knows_the_registered_task(capsys):
-    _, task, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    _, task, _ = crane_policies.load_policy(SHIPPED)
     eval_crane.task_of(Args(env_id=CRANE), task)
     assert capsys.readouterr().err == ""
 
@@ -371,7 +371,7 @@ def test_viewer_needs_a_display(run_here, monkeypatch):
 @pytest.mark.slow
 def test_sampling_is_repeatable():
     """It changes the trials, and the seed makes it repeatable."""
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(SHIPPED)
     misses = []
     for stochastic in (False, True, True):
         torch.manual_seed(1)
@@ -397,13 +397,13 @@ def test_stochastic_trials_from_the_command_line(run_here, tmp_path):
 
 @pytest.mark.slow
 def test_sdf_trials():
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(SHIPPED)
     args = Args(trials=2, diameters=(0.5,), seed=3, env_threads=1)
     records = list(judge(policy, CRANE, {"contact": "sdf"}, args))
     assert len(records) == 2 and any(record["success"] for record in records)
 
 
-@pytest.mark.parametrize("script", eval_crane.SCRIPTS)
+@pytest.mark.parametrize("script", crane_policies.SCRIPTS)
 def test_acts_as_the_agent_of_any_algorithm(tmp_path, script):
     torch.manual_seed(0)
     args = script.Args(hidden_sizes=(16,))
@@ -423,7 +423,7 @@ def test_acts_as_the_agent_of_any_algorithm(tmp_path, script):
         "fingerprint": crane_runs.fingerprint(agent, 18),
     }
     torch.save(policy, tmp_path / "policy.pt")
-    loaded, trained_on, name = eval_crane.load_policy(tmp_path)  # the run's folder or the file
+    loaded, trained_on, name = crane_policies.load_policy(tmp_path)  # the run's folder or the file
     assert name == script.ALGORITHM and trained_on == task
     obs = torch.randn(3, 5, 18)  # three decisions of five cranes
     with torch.no_grad():
@@ -464,13 +464,17 @@ def test_same_trial_in_any_batch(monkeypatch):
     assert list(judge(FixedPolicy("zero"), CRANE, {}, args)) == together
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mp4", "gif"])
-def test_video(tmp_path, run_here, monkeypatch, kind):
+@pytest.fixture
+def open_gl():
     try:
         mujoco.Renderer(machine.load_model(), 8, 8).close()
     except Exception as error:
         pytest.skip(f"no OpenGL here: {error}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+def test_video(tmp_path, run_here, monkeypatch, open_gl, kind):
     monkeypatch.setattr(crane_task, "REACH_TIME", 0.4)  # an idle crane fails then
     film, seeds = tmp_path / f"film.{kind}", []
 
@@ -489,6 +493,21 @@ def test_video(tmp_path, run_here, monkeypatch, kind):
     assert len(frames) == 2 * (8 + 10) if kind == "mp4" else 2 <= len(frames) <= 36
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50  # of another trial
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+def test_a_film_counts_its_successes(tmp_path, run_here, monkeypatch, open_gl):
+    """The scripted crane lifts two logs and is too late for a third."""
+    monkeypatch.setattr(crane_view, "FPS", 1)
+    film, late = tmp_path / "film.mp4", crane_task.REACH_TIME
+
+    class Trial(crane_view.Trial):
+        def __init__(self, crane, seed, diameter):
+            monkeypatch.setattr(crane_task, "REACH_TIME", 0.4 if diameter == 0.5 else late)
+            super().__init__(crane, seed, diameter)
+
+    monkeypatch.setattr(crane_view, "Trial", Trial)
+    line = ("--policy", "scripted", "--diameters", "0.4", "0.5", "0.6", "--width", "128")
+    assert f"3 trials filmed in {film}, 2 succeeded" in run_here(*line, "--video", film).out
 
 
 def test_clear_errors(tmp_path, run_here, capsys):
@@ -524,8 +543,8 @@ def test_clear_errors(tmp_path, run_here, capsys):
     assert "seed must be a whole number in [0, " in error_of("--seed", "-1")
     assert "env_threads must be a whole number in [0, 256]" in error_of("--env-threads", "-1")
     assert "PATH goes with" in error_of(tmp_path / "junk.pt", "--policy", "zero")
-    assert "PATH names a policy twice" in error_of(eval_crane.SHIPPED, eval_crane.SHIPPED)
-    two = [eval_crane.SHIPPED, eval_crane.SHIPPED.with_name("ppo_crane.pt")]
+    assert "PATH names a policy twice" in error_of(SHIPPED, SHIPPED)
+    two = [SHIPPED, SHIPPED.with_name("ppo_crane.pt")]
     assert "take one policy" in error_of(*two, "--csv", "trials.csv")
     assert "--stochastic goes with" in error_of("--policy", "random", "--stochastic")
     assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
@@ -546,10 +565,10 @@ def test_clear_errors_of_damaged_policies(tmp_path, capsys):
     def error_of(**change):
         torch.save(saved | change, path)
         with pytest.raises(SystemExit) as error:
-            eval_crane.load_policy(path)
+            crane_policies.load_policy(path)
         return str(error.value).removeprefix(str(path))
 
-    saved = torch.load(eval_crane.SHIPPED, weights_only=True)
+    saved = torch.load(SHIPPED, weights_only=True)
     known = "mppo_beta, ppo, trpo, recurrent_ppo"
     gone = f": unknown algorithm 'sac'; known: {known}; its script sac.py is not in this folder"
     assert error_of(algorithm="sac", script="sac.py") == gone
@@ -566,13 +585,13 @@ def test_clear_errors_of_damaged_policies(tmp_path, capsys):
         torch.save({key: value for key, value in saved.items() if key != name}, path)
         if name not in ("script", "global_step"):
             with pytest.raises(SystemExit, match="policy.pt "):
-                eval_crane.load_policy(path)
+                crane_policies.load_policy(path)
     path.write_bytes(b"junk")
     with pytest.raises(SystemExit, match="is no policy.pt of this repository"):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
     assert capsys.readouterr().err == ""
     torch.save(saved | {"task": saved["task"] | {"revision": -1}}, path)
-    eval_crane.load_policy(path)
+    crane_policies.load_policy(path)
     assert "was trained on task revision -1" in capsys.readouterr().err
 
 
@@ -585,7 +604,7 @@ def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, mon
     subprocess.run(command, cwd=tmp_path, env=paths, check=True, capture_output=True)
     (path,) = tmp_path.glob("runs/*/policy.pt")
     monkeypatch.chdir(tmp_path)
-    agent, _, algorithm = eval_crane.load_policy(path)
+    agent, _, algorithm = crane_policies.load_policy(path)
     assert isinstance(agent.actor[1], torch.nn.ReLU) and algorithm == "ppo"
     printed = run_here(path, "--trials", "1", "--pose-noise", "none").out
     assert "my_ppo_crane.py (" in printed and "| 0.8 " in printed
@@ -593,20 +612,20 @@ def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, mon
     assert str(path) in scores and "mean of" not in scores
     copy.write_text(copy.read_text().replace("nn.ReLU()", "nn.SiLU()"))
     with pytest.raises(SystemExit, match="undo the change of my_ppo_crane.py or train"):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
     copy.rename(tmp_path / "gone.py")
     said = (
         "/ppo_crane.py acts otherwise than in the training; my_ppo_crane.py wrote it; copy my_ppo"
     )
     with pytest.raises(SystemExit, match=said):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
     saved = torch.load(path, weights_only=True)
     torch.save({key: value for key, value in saved.items() if key != "script"}, path)
     with pytest.raises(SystemExit, match="otherwise than in the training; undo the change of ppo_"):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
     torch.save(saved | {"algorithm": "my_ppo"}, path)
     with pytest.raises(SystemExit, match="its script my_ppo_crane.py is not in this folder"):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
 
 
 def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):

@@ -11,6 +11,7 @@ import stable_baselines3
 import torch
 from script_runs import ALGORITHMS, ROOT
 
+import crane_policies
 import eval_crane
 import export_onnx
 import ppo_crane
@@ -22,11 +23,11 @@ def test_an_onnx_file_acts_as_the_policy(tmp_path, algorithm):
     """In turn, with the memory of an LSTM, for another number of cranes than at the export."""
     path = ROOT / "assets" / "policies" / f"{algorithm}_crane.pt"
     export_onnx.main(path, tmp_path / "policy.onnx")
-    agent, task, _ = eval_crane.load_policy(path)
+    agent, task, _ = crane_policies.load_policy(path)
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
     memory = {i.name: np.zeros((7, i.shape[1]), "f4") for i in session.get_inputs()[1:]}
     assert len(memory) == (2 if algorithm == "recurrent_ppo" else 0)
-    judged, judged_task, name = eval_crane.load_policy(tmp_path / "policy.onnx")
+    judged, judged_task, name = crane_policies.load_policy(tmp_path / "policy.onnx")
     assert (judged_task, name) == (task, algorithm)
     rng, state, judged_state = np.random.default_rng(0), None, None
     for _ in range(5):
@@ -42,7 +43,7 @@ def test_an_onnx_file_acts_as_the_policy(tmp_path, algorithm):
 
 def test_the_onnx_file_lifts_logs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    export_onnx.main(eval_crane.SHIPPED, tmp_path / "policy.onnx")
+    export_onnx.main(crane_policies.SHIPPED, tmp_path / "policy.onnx")
     line = ["eval_crane.py", "policy.onnx", "--trials", "2", "--pose-noise", "none"]
     monkeypatch.setattr(sys, "argv", line)
     eval_crane.main()
@@ -51,7 +52,7 @@ def test_the_onnx_file_lifts_logs(tmp_path, capsys, monkeypatch):
 
 
 def test_the_command_writes_a_file(tmp_path):
-    line = [sys.executable, ROOT / "export_onnx.py", eval_crane.SHIPPED, tmp_path / "a.onnx"]
+    line = [sys.executable, ROOT / "export_onnx.py", crane_policies.SHIPPED, tmp_path / "a.onnx"]
     result = subprocess.run(line, capture_output=True, text=True)
     assert result.returncode == 0 and "mppo_beta written to" in result.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
@@ -62,7 +63,7 @@ def test_an_agent_with_another_predict_is_not_exported(tmp_path, monkeypatch):
     predict = ppo_crane.Agent.predict
     half = lambda *args, **kwargs: (predict(*args, **kwargs)[0] / 2, None)  # noqa: E731
     monkeypatch.setattr(ppo_crane.Agent, "predict", half)
-    monkeypatch.setattr(eval_crane, "script_of", lambda saved, path: ppo_crane)
+    monkeypatch.setattr(crane_policies, "script_of", lambda saved, path: ppo_crane)
     path = ROOT / "assets" / "policies" / "ppo_crane.pt"
     saved = torch.load(path, weights_only=True)
     saved["fingerprint"] /= 2  # as of a run of the changed script
@@ -79,7 +80,7 @@ def test_a_model_of_stable_baselines3_is_judged(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     model = getattr(stable_baselines3, name)("MlpPolicy", "ForestryCrane-v0", seed=1)
     model.save("model.zip")
-    policy, task, _ = eval_crane.load_policy(tmp_path / "model.zip")
+    policy, task, _ = crane_policies.load_policy(tmp_path / "model.zip")
     ours = evaluate(policy, task["env_id"], 1, 40_000)
     assert ours == evaluate(model, "ForestryCrane-v0", 1, 40_000)
     with pytest.raises(SystemExit, match="model.zip is no policy.pt of this"):
@@ -97,7 +98,7 @@ def test_damaged_files_are_named(tmp_path, kind):
     path = tmp_path / f"policy.{kind}"
     path.write_bytes(b"junk")
     with pytest.raises(SystemExit, match=f"policy.{kind}"):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
 
 
 def test_an_onnx_file_of_others_is_told_what_to_do(tmp_path):
@@ -114,10 +115,10 @@ def test_an_onnx_file_of_others_is_told_what_to_do(tmp_path):
     opset = [onnx.helper.make_opsetid("", 17)]
     onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), path)
     with pytest.raises(SystemExit, match="not of export_onnx.py.*--policy my_module:MyPolicy"):
-        eval_crane.load_policy(path)
+        crane_policies.load_policy(path)
 
 
 def test_the_files_name_is_checked_first(tmp_path):
     with pytest.raises(SystemExit, match="policy.bin must end in .onnx"):
-        export_onnx.main(eval_crane.SHIPPED, tmp_path / "policy.bin")
+        export_onnx.main(crane_policies.SHIPPED, tmp_path / "policy.bin")
     assert not list(tmp_path.iterdir())

@@ -19,6 +19,7 @@ from script_runs import ALGORITHMS, TWO, command, environment, module, only_run,
 
 import crane_env
 import crane_options
+import crane_policies
 import crane_runs
 import crane_trials
 import eval_crane
@@ -265,7 +266,7 @@ def test_no_code_of_a_checkpoint_runs(tmp_path, run_here, algorithm):
     with pytest.raises(SystemExit, match="checkpoint.pt is damaged or not of this script"):
         run_here(algorithm, "--resume", ".")
     with pytest.raises(SystemExit, match="is no policy.pt"):
-        eval_crane.load_policy(tmp_path / "policy.pt")
+        crane_policies.load_policy(tmp_path / "policy.pt")
     assert not (tmp_path / "code ran").exists()
 
 

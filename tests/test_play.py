@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import eval_crane
+import crane_policies
 from crane_env import CraneVectorEnv
 from crane_trials import monte_carlo_trials
 
@@ -28,7 +28,7 @@ pytestmark = [
 
 def test_the_page_has_the_crane_of_python(tmp_path):
     """Same start and observation; open loop the logs are lifted in both versions of MuJoCo."""
-    policy, _, _ = eval_crane.load_policy(eval_crane.SHIPPED)
+    policy, _, _ = crane_policies.load_policy(crane_policies.SHIPPED)
     for diameter in (0.3, 0.5, 0.8):
         envs = CraneVectorEnv(1, diameter=diameter)
         obs, _ = envs.reset(seed=monte_carlo_trials(40_000, 1, [diameter])[1])
@@ -64,7 +64,7 @@ def test_a_crane_that_does_not_move_fails(tmp_path):
 def test_the_page_runs_in_a_browser():
     """The policy moves the crane, and nothing throws."""
     onnx = PLAY / "policy.onnx"
-    export = [sys.executable, "export_onnx.py", str(eval_crane.SHIPPED), str(onnx)]
+    export = [sys.executable, "export_onnx.py", str(crane_policies.SHIPPED), str(onnx)]
     subprocess.run(export, cwd=ROOT, check=True, capture_output=True)
     quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
     handler = functools.partial(quiet, directory=ROOT)

@@ -6,9 +6,9 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
+import crane_policies
 import crane_task
 import crane_trials
-import eval_crane
 from crane_env import CraneVectorEnv
 from sb3_crane import CraneVecEnv
 
@@ -72,7 +72,7 @@ def test_a_model_with_state_dependent_exploration_loads(tmp_path):
     model = PPO("MlpPolicy", CraneVecEnv(2), use_sde=True, device="cpu")
     model.save(tmp_path / "model.zip")
     obs = np.random.default_rng(0).normal(size=(3, 18)).astype(np.float32)
-    loaded = eval_crane.load_sb3(tmp_path / "model.zip")
+    loaded = crane_policies.load_sb3(tmp_path / "model.zip")
     np.testing.assert_array_equal(
         loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]
     )

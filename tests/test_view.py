@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import crane_env
+import crane_policies
 import crane_trials
 import crane_view
 import eval_crane
@@ -114,7 +115,7 @@ def look(monkeypatch, plan, holds=None, **options):
 
     monkeypatch.setattr(FakeWindow, "__init__", remember)
     args = eval_crane.Args(policy="zero", diameters=(0.4, 0.5))
-    zero = eval_crane.FixedPolicy("zero")
+    zero = crane_policies.FixedPolicy("zero")
     crane_view.show(zero, "zero", "ForestryCrane-v0", options, args)
     return windows[0], slept
 

@@ -1,0 +1,223 @@
+"""Load a policy to judge, whatever wrote it.
+
+    policy, task, name = load_policy(Path("runs/<run>"))
+    actions, state = policy.predict(obs, None)  # obs (N, 18), actions (N, 6); state is its memory
+
+A policy is a policy.pt of the four scripts or of an edited copy, a model of Stable-Baselines3
+(.zip), an .onnx file of export_onnx.py, or a class of your own (docs/compare.md).
+"""
+
+import importlib
+import importlib.util
+import inspect
+import json
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+import crane_env
+import crane_options
+import crane_runs
+import mppo_beta_crane
+import ppo_crane
+import recurrent_ppo_crane
+import trpo_crane
+
+SCRIPTS = (mppo_beta_crane, ppo_crane, trpo_crane, recurrent_ppo_crane)
+ALGORITHMS = {script.ALGORITHM: script for script in SCRIPTS}
+SHIPPED = Path(__file__).parent / "assets" / "policies" / "mppo_beta_crane.pt"
+
+
+def script_of(saved: dict[str, Any], path: Path) -> ModuleType:
+    """The script that wrote a policy.pt: one of the four, or an edited copy in this folder."""
+    name, algorithm = Path(saved.get("script", "")).name, saved["algorithm"]
+    for folder in (Path.cwd(), Path(__file__).parent):
+        file = folder / name
+        if file.suffix == ".py" and file.is_file() and "class Agent" in file.read_text():
+            spec = importlib.util.spec_from_file_location(file.stem, file)
+            script = importlib.util.module_from_spec(spec)
+            sys.modules[file.stem] = script  # where dataclasses look for it
+            spec.loader.exec_module(script)
+            return script
+    if algorithm not in ALGORITHMS:
+        wanted = f"; its script {name} is not in this folder" if name else ""
+        known = ", ".join(ALGORITHMS)
+        raise SystemExit(f"{path}: unknown algorithm {algorithm!r}; known: {known}{wanted}")
+    return ALGORITHMS[algorithm]
+
+
+def load_policy(path: Path) -> tuple[Any, dict[str, Any], str]:
+    """The policy in a file or a run's folder, its task and its name. SystemExit if it has none.
+
+    The task is `env_id`, `revision` and all options of the environment. A model of
+    Stable-Baselines3 does not know its options. The name is the algorithm's, or the file's name of
+    an edited copy.
+    """
+    file = path / "policy.pt" if path.is_dir() else path
+    if not file.is_file():
+        raise SystemExit(f"no file {file}; {hint_for(path)}")
+    if file.suffix == ".zip":
+        return load_sb3(file), {"env_id": "ForestryCrane-v0"}, "Stable-Baselines3"
+    if file.suffix == ".onnx":
+        policy = OnnxPolicy(file)
+        warn_of_revision(file, policy.task)
+        return policy, policy.task, policy.name
+    return load_agent(file)
+
+
+def hint_for(path: Path) -> str:
+    """What to do, as no policy is at path."""
+    if str(path) in ("scripted", "zero", "random"):
+        return f"--policy {path}"
+    for folder in (path, path.parent):
+        runs = [run for run in folder.glob("*/policy.pt") if run.is_file()]
+        if runs:
+            return f"the newest run there is {max(runs, key=os.path.getmtime).parent}"
+    return "train one first, or give a run's policy.pt"
+
+
+def load_agent(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
+    """The agent in a policy.pt, its task and its name."""
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        algorithm, task = saved["algorithm"], dict(saved["task"])
+        weights, args, expected = saved["weights"], dict(saved["args"]), saved["fingerprint"]
+    except Exception:  # a damaged file raises many kinds
+        raise SystemExit(f"{path} is no policy.pt of this repository") from None
+    script = script_of(saved, path)
+    if "frame_skip" not in task:
+        raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
+    task = crane_options.DEFAULTS | task  # an option that is newer than the file has its default
+    warn_of_revision(path, task)
+    try:
+        obs_dim, low, high = (saved["spaces"][name] for name in ("obs_dim", "low", "high"))
+        agent = script.Agent(obs_dim, low.numpy(), high.numpy(), script.Args(**args))
+        # policy.pt has no critic, and acting needs none
+        agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
+    except Exception as error:
+        reason = (str(error).splitlines() or [repr(error)])[-1].strip()
+        raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
+    actions = crane_runs.fingerprint(agent, obs_dim)
+    if not torch.allclose(actions, expected, atol=1e-3):
+        wrote, used = Path(saved.get("script", "")).name, Path(script.__file__)
+        mend = f"undo the change of {used.name} or train again"
+        if wrote not in ("", used.name):
+            mend = f"{wrote} wrote it; copy {wrote}, with its Agent, here"
+        raise SystemExit(f"{path}: the Agent of {used} acts otherwise than in the training; {mend}")
+    edited = script.__name__ != f"{algorithm}_crane"
+    return agent, task, f"{script.__name__}.py" if edited else algorithm
+
+
+def warn_of_revision(path: Path, task: dict[str, Any]) -> None:
+    if task.get("revision") != crane_env.REVISION:
+        print(f"{path} was trained on task revision {task.get('revision')}", file=sys.stderr)
+
+
+def load_sb3(path: Path) -> Any:
+    """The policy in a model of Stable-Baselines3 or sb3-contrib. It needs that library."""
+    try:
+        from stable_baselines3.common.save_util import load_from_zip_file
+
+        data, weights, _ = load_from_zip_file(path)
+        spaces = data["observation_space"], data["action_space"]
+        options = {"use_sde": True} if data.get("use_sde") else {}
+        options |= data["policy_kwargs"]
+        policy = data["policy_class"](*spaces, lambda _: 0.0, **options)
+        policy.load_state_dict(weights["policy"])
+        scaled = data.get("_last_original_obs") is not None
+    except Exception as error:  # a missing library, a damaged file, a model of another version
+        raise SystemExit(f"{path}: {error}") from None
+    if scaled:
+        lack = "was trained with VecNormalize, whose statistics are not in the .zip"
+        print(f"{path} {lack}; see docs/compare.md, recipe 4", file=sys.stderr)
+    policy.set_training_mode(False)
+    return policy
+
+
+class OnnxPolicy:
+    """What export_onnx.py wrote."""
+
+    def __init__(self, path: Path):
+        try:
+            import onnxruntime
+
+            self.session = onnxruntime.InferenceSession(path)
+        except Exception as error:  # a missing library, a damaged file
+            raise SystemExit(f"{path}: {error}") from None
+        known = self.session.get_modelmeta().custom_metadata_map
+        if not known.keys() >= {"task", "algorithm"}:
+            hint = "wrap it in a class of your own for --policy my_module:MyPolicy"
+            raise SystemExit(f"{path} is not of export_onnx.py and names no task; {hint}")
+        self.task, self.name = json.loads(known["task"]), known["algorithm"]
+        self.memory = self.session.get_inputs()[1:]
+
+    def predict(self, obs: np.ndarray, state: list | None, deterministic: bool = True):
+        """Actions (N, 6) and the memory after them. An .onnx file has the mean action only."""
+        state = state or [np.zeros((len(obs), i.shape[1]), np.float32) for i in self.memory]
+        inputs = {i.name: part for i, part in zip(self.memory, state)}
+        actions, *state = self.session.run(None, {"obs": np.float32(obs), **inputs})
+        return actions, state
+
+
+class FixedPolicy:
+    """Zero or uniformly random actions, from torch's generator, which each table seeds anew."""
+
+    def __init__(self, kind: str):
+        self.scale = float(kind == "random")
+
+    def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True):
+        return self.scale * (2 * torch.rand(len(obs), 6).numpy() - 1), None
+
+
+class OwnPolicy:
+    """A user's policy as `run_trials` wants it.
+
+    make() gives a function from observations to actions, or an object with `predict` as
+    Stable-Baselines3 has it. Each batch of trials gets one of its own.
+    """
+
+    def __init__(self, name: str):
+        module, _, attribute = name.partition(":")
+        sys.path.insert(0, os.getcwd())
+        try:
+            found = importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module:  # of an import in the user's module
+                raise
+            raise SystemExit(f"--policy {name}: {error}") from None
+        self.make = getattr(found, attribute, None)
+        try:
+            inspect.signature(self.make).bind()
+        except (TypeError, ValueError) as error:
+            wanted = f"{attribute or 'it'} must be a class or function without arguments"
+            raise SystemExit(f"--policy {name}: {error}; {wanted}") from None
+        self.name = name
+
+    def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True):
+        """state: the user's object and, if it has `predict`, its own state."""
+        policy, memory = (self.make(), None) if state is None else state
+        if hasattr(policy, "predict"):
+            answer = policy.predict(obs, memory, deterministic=deterministic)
+            if not isinstance(answer, tuple) or len(answer) != 2:
+                raise SystemExit(f"--policy {self.name}: predict must return actions and a state")
+            actions, memory = answer
+        elif callable(policy):
+            actions = policy(obs)
+        else:
+            raise SystemExit(f"--policy {self.name}: {policy!r} is no function and has no predict")
+        try:
+            actions = torch.as_tensor(actions).detach().cpu().numpy()
+        except (TypeError, ValueError, RuntimeError):
+            kind = type(actions).__name__
+            raise SystemExit(f"--policy {self.name}: actions are a {kind}, no array") from None
+        if actions.shape != (len(obs), 6):
+            wanted = f"({len(obs)}, 6) for observations {obs.shape}"
+            raise SystemExit(f"--policy {self.name}: actions {actions.shape}, not {wanted}")
+        if not np.isfinite(actions).all():
+            raise SystemExit(f"--policy {self.name}: actions contain NaN or infinity")
+        return actions, (policy, memory)
