@@ -1,10 +1,13 @@
-"""Load a policy to judge, whatever wrote it.
+"""Policies to judge: what a file holds, a class of your own, or fixed actions.
+
+    from crane_policies import load_policy
 
     policy, task, name = load_policy(Path("runs/<run>"))
-    actions, state = policy.predict(obs, None)  # obs (N, 18), actions (N, 6); state is its memory
+    actions, state = policy.predict(obs, None, deterministic=True)
 
-A policy is a policy.pt of the four scripts or of an edited copy, a model of Stable-Baselines3
-(.zip), an .onnx file of export_onnx.py, or a class of your own (docs/compare.md).
+obs is (N, 18 or 32) and actions (N, 6). state is the policy's memory, None before the first
+decision. `load_policy` reads a policy.pt of the four scripts or of an edited copy, a model of
+Stable-Baselines3 (.zip), and an .onnx file of export_onnx.py. docs/compare.md has recipes.
 """
 
 import importlib
@@ -15,7 +18,7 @@ import os
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -33,11 +36,13 @@ ALGORITHMS = {script.ALGORITHM: script for script in SCRIPTS}
 SHIPPED = Path(__file__).parent / "assets" / "policies" / "mppo_beta_crane.pt"
 
 
-def script_of(saved: dict[str, Any], path: Path) -> ModuleType:
-    """The script that wrote a policy.pt: one of the four, or an edited copy in this folder."""
-    name, algorithm = Path(saved.get("script", "")).name, saved["algorithm"]
+def script_of(name: str, algorithm: str, path: Path) -> ModuleType:
+    """The script of this name in this folder, an edited copy or one of ours; or the algorithm's."""
+    ours = {Path(script.__file__).resolve(): script for script in SCRIPTS}
     for folder in (Path.cwd(), Path(__file__).parent):
-        file = folder / name
+        file = (folder / name).resolve()
+        if file in ours:
+            return ours[file]
         if file.suffix == ".py" and file.is_file() and "class Agent" in file.read_text():
             spec = importlib.util.spec_from_file_location(file.stem, file)
             script = importlib.util.module_from_spec(spec)
@@ -52,11 +57,11 @@ def script_of(saved: dict[str, Any], path: Path) -> ModuleType:
 
 
 def load_policy(path: Path) -> tuple[Any, dict[str, Any], str]:
-    """The policy in a file or a run's folder, its task and its name. SystemExit if it has none.
+    """The policy in a file or a run's folder, the task it was trained on, a name for the tables.
 
     The task is `env_id`, `revision` and all options of the environment. A model of
-    Stable-Baselines3 does not know its options. The name is the algorithm's, or the file's name of
-    an edited copy.
+    Stable-Baselines3 does not know its options. The name is the algorithm's, that of an edited
+    copy's file, or Stable-Baselines3. SystemExit says what is wrong with the file.
     """
     file = path / "policy.pt" if path.is_dir() else path
     if not file.is_file():
@@ -71,7 +76,7 @@ def load_policy(path: Path) -> tuple[Any, dict[str, Any], str]:
 
 
 def hint_for(path: Path) -> str:
-    """What to do, as no policy is at path."""
+    """The mend for a path that has no policy."""
     if str(path) in ("scripted", "zero", "random"):
         return f"--policy {path}"
     for folder in (path, path.parent):
@@ -85,13 +90,15 @@ def load_agent(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     """The agent in a policy.pt, its task and its name."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        algorithm, task = saved["algorithm"], dict(saved["task"])
+        algorithm, task = str(saved["algorithm"]), dict(saved["task"])
         weights, args, expected = saved["weights"], dict(saved["args"]), saved["fingerprint"]
+        wrote = Path(saved.get("script", "")).name  # older files do not name it
     except Exception:  # a damaged file raises many kinds
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
-    script = script_of(saved, path)
-    if "frame_skip" not in task:
+    if "frame_skip" not in task:  # an option that only the crane has
         raise SystemExit(f"{path} was trained on {task.get('env_id')}, not on the crane")
+    script = script_of(wrote, algorithm, path)
+    used = Path(script.__file__).name
     task = crane_options.DEFAULTS | task  # an option that is newer than the file has its default
     warn_of_revision(path, task)
     try:
@@ -99,18 +106,20 @@ def load_agent(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         agent = script.Agent(obs_dim, low.numpy(), high.numpy(), script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
-    except Exception as error:
+        actions = crane_runs.fingerprint(agent, obs_dim)
+        same = torch.allclose(actions, expected, atol=1e-3)
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
-        raise SystemExit(f"{path} does not fit {algorithm}: {reason}") from None
-    actions = crane_runs.fingerprint(agent, obs_dim)
-    if not torch.allclose(actions, expected, atol=1e-3):
-        wrote, used = Path(saved.get("script", "")).name, Path(script.__file__)
-        mend = f"undo the change of {used.name} or train again"
-        if wrote not in ("", used.name):
+        mend = "judge it with the script that wrote it"
+        raise SystemExit(f"{path} does not fit {used}: {reason}; {mend}") from None
+    if not same:
+        mend = f"undo the change of {used} or train again"
+        if wrote not in ("", used):
             mend = f"{wrote} wrote it; copy {wrote}, with its Agent, here"
-        raise SystemExit(f"{path}: the Agent of {used} acts otherwise than in the training; {mend}")
-    edited = script.__name__ != f"{algorithm}_crane"
-    return agent, task, f"{script.__name__}.py" if edited else algorithm
+        told = f"the Agent of {script.__file__} acts otherwise than in the training"
+        raise SystemExit(f"{path}: {told}; {mend}")
+    ours = (f"{algorithm}_crane.py", "mppo_beta_torchrun.py")
+    return agent, task, algorithm if used in ours else used
 
 
 def warn_of_revision(path: Path, task: dict[str, Any]) -> None:
@@ -130,8 +139,10 @@ def load_sb3(path: Path) -> Any:
         policy = data["policy_class"](*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights["policy"])
         scaled = data.get("_last_original_obs") is not None
-    except Exception as error:  # a missing library, a damaged file, a model of another version
-        raise SystemExit(f"{path}: {error}") from None
+    except ImportError as error:
+        raise SystemExit(f"{path}: {error}; install Stable-Baselines3 (docs/compare.md)") from None
+    except Exception as error:  # a damaged file, a model of another version
+        raise SystemExit(f"{path} is no model of Stable-Baselines3: {error}") from None
     if scaled:
         lack = "was trained with VecNormalize, whose statistics are not in the .zip"
         print(f"{path} {lack}; see docs/compare.md, recipe 4", file=sys.stderr)
@@ -140,24 +151,28 @@ def load_sb3(path: Path) -> Any:
 
 
 class OnnxPolicy:
-    """What export_onnx.py wrote."""
+    """A policy in an .onnx file of export_onnx.py. SystemExit says what is wrong with the file."""
 
     def __init__(self, path: Path):
         try:
             import onnxruntime
 
             self.session = onnxruntime.InferenceSession(path)
-        except Exception as error:  # a missing library, a damaged file
-            raise SystemExit(f"{path}: {error}") from None
+        except ImportError as error:
+            raise SystemExit(f"{path}: {error}; pip install onnxruntime") from None
+        except Exception as error:
+            raise SystemExit(f"{path} is no ONNX file: {error}") from None
         known = self.session.get_modelmeta().custom_metadata_map
         if not known.keys() >= {"task", "algorithm"}:
             hint = "wrap it in a class of your own for --policy my_module:MyPolicy"
             raise SystemExit(f"{path} is not of export_onnx.py and names no task; {hint}")
-        self.task, self.name = json.loads(known["task"]), known["algorithm"]
+        # an option that is newer than the file has its default
+        self.task = crane_options.DEFAULTS | json.loads(known["task"])
+        self.name = known["algorithm"]
         self.memory = self.session.get_inputs()[1:]
 
     def predict(self, obs: np.ndarray, state: list | None, deterministic: bool = True):
-        """Actions (N, 6) and the memory after them. An .onnx file has the mean action only."""
+        """Mean actions (N, 6) for obs (N, obs_dim), and the memory after them."""
         state = state or [np.zeros((len(obs), i.shape[1]), np.float32) for i in self.memory]
         inputs = {i.name: part for i, part in zip(self.memory, state)}
         actions, *state = self.session.run(None, {"obs": np.float32(obs), **inputs})
@@ -167,36 +182,40 @@ class OnnxPolicy:
 class FixedPolicy:
     """Zero or uniformly random actions, from torch's generator, which each table seeds anew."""
 
-    def __init__(self, kind: str):
-        self.scale = float(kind == "random")
+    def __init__(self, kind: Literal["zero", "random"]):
+        self.kind = kind
 
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True):
-        return self.scale * (2 * torch.rand(len(obs), 6).numpy() - 1), None
+        if self.kind == "zero":
+            return np.zeros((len(obs), 6)), None
+        return 2 * torch.rand(len(obs), 6).numpy() - 1, None
 
 
 class OwnPolicy:
-    """A user's policy as `run_trials` wants it.
+    """A user's policy as `run_trials` wants it. SystemExit says what is wrong with it.
 
     make() gives a function from observations to actions, or an object with `predict` as
     Stable-Baselines3 has it. Each batch of trials gets one of its own.
     """
 
-    def __init__(self, name: str):
-        module, _, attribute = name.partition(":")
-        sys.path.insert(0, os.getcwd())
+    def __init__(self, policy: str):
+        """policy: my_module:MyPolicy"""
+        self.policy = policy
+        module, _, attribute = policy.partition(":")
         try:
             found = importlib.import_module(module)
         except ModuleNotFoundError as error:
-            if error.name != module:  # of an import in the user's module
+            if not f"{module}.".startswith(f"{error.name}."):  # of an import in the user's module
                 raise
-            raise SystemExit(f"--policy {name}: {error}") from None
-        self.make = getattr(found, attribute, None)
+            raise SystemExit(f"--policy {policy}: {error}") from None
+        if not hasattr(found, attribute):
+            raise SystemExit(f"--policy {policy}: {found.__file__} has no {attribute}")
+        self.make = getattr(found, attribute)
         try:
             inspect.signature(self.make).bind()
         except (TypeError, ValueError) as error:
-            wanted = f"{attribute or 'it'} must be a class or function without arguments"
-            raise SystemExit(f"--policy {name}: {error}; {wanted}") from None
-        self.name = name
+            wanted = f"{attribute} must be a class or function without arguments"
+            raise SystemExit(f"--policy {policy}: {error}; {wanted}") from None
 
     def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True):
         """state: the user's object and, if it has `predict`, its own state."""
@@ -204,20 +223,20 @@ class OwnPolicy:
         if hasattr(policy, "predict"):
             answer = policy.predict(obs, memory, deterministic=deterministic)
             if not isinstance(answer, tuple) or len(answer) != 2:
-                raise SystemExit(f"--policy {self.name}: predict must return actions and a state")
+                raise SystemExit(f"--policy {self.policy}: predict must return actions and a state")
             actions, memory = answer
         elif callable(policy):
             actions = policy(obs)
         else:
-            raise SystemExit(f"--policy {self.name}: {policy!r} is no function and has no predict")
-        try:
-            actions = torch.as_tensor(actions).detach().cpu().numpy()
-        except (TypeError, ValueError, RuntimeError):
-            kind = type(actions).__name__
-            raise SystemExit(f"--policy {self.name}: actions are a {kind}, no array") from None
-        if actions.shape != (len(obs), 6):
-            wanted = f"({len(obs)}, 6) for observations {obs.shape}"
-            raise SystemExit(f"--policy {self.name}: actions {actions.shape}, not {wanted}")
+            given = f"{policy!r} is no function and has no predict"
+            raise SystemExit(f"--policy {self.policy}: {given}")
+        if isinstance(actions, torch.Tensor):
+            actions = actions.detach().cpu()
+        actions = np.asarray(actions)
+        if actions.dtype.kind not in "fiu" or actions.shape != (len(obs), 6):
+            wanted = f"numbers ({len(obs)}, 6) for observations {obs.shape}"
+            given = f"actions must be {wanted}, got {actions.dtype} {actions.shape}"
+            raise SystemExit(f"--policy {self.policy}: {given}")
         if not np.isfinite(actions).all():
-            raise SystemExit(f"--policy {self.name}: actions contain NaN or infinity")
+            raise SystemExit(f"--policy {self.policy}: actions contain NaN or infinity")
         return actions, (policy, memory)

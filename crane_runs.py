@@ -2,7 +2,7 @@
 
 This module has no learning. The training scripts call it in this order: `read_arguments`,
 `Run(...)`, `run.iterations()`, after each update `run.finish_update(...)`, and `run.finish()`.
-eval_crane.py and export_onnx.py use `one_line_errors` and `fingerprint`.
+eval_crane.py, export_onnx.py and crane_policies.py use `one_line_errors` or `fingerprint`.
 """
 
 import io

@@ -1,7 +1,7 @@
 """Cranes to train a policy and to judge it on, and the trials that judge it.
 
-The training scripts and eval_crane.py use it. docs/compare.md has the protocol of the trials:
-log diameters 0.3 ... 0.8 m, seeds that belong to the trial alone, success as `CraneVectorEnv` says.
+docs/compare.md has the protocol of the trials: log diameters 0.3 ... 0.8 m, seeds that belong to
+the trial alone, success as `CraneVectorEnv` says.
 """
 
 import importlib
@@ -26,7 +26,10 @@ RESULTS |= {*CONDITIONS, *CARE}
 
 
 def is_crane(env_id: str) -> bool:
-    """Whether the task is this crane or a subclass of it: `CraneVectorEnv` steps it."""
+    """Whether the task is this crane or a subclass of it: `CraneVectorEnv` steps it.
+
+    gymnasium.error.Error if there is no such task, ModuleNotFoundError if no such module.
+    """
     module, _, name = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
@@ -52,7 +55,7 @@ def make_envs(
         envs = gymnasium.make_vec(env_id, num_envs, "sync", vector_kwargs=autoreset)
     for space in (envs.single_observation_space, envs.single_action_space):
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            raise OptionError("its observations or actions are no flat Box")
+            raise OptionError(f"{env_id}: observations or actions are no flat Box")
     return RecordEpisodeStatistics(envs)
 
 
@@ -67,7 +70,9 @@ def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[
         if recent := [success for outcomes in crane.recent_success for success in outcomes]:
             report["charts/success_rate"] = np.mean(recent)
         report["schedule/difficulty"] = crane.difficulty
-        report |= {t.replace("r_", "reward/"): np.mean([info[t] for info in infos]) for t in TERMS}
+        for term in TERMS:
+            name = f"reward/{term.removeprefix('r_')}"
+            report[name] = np.mean([info[term] for info in infos])
         if ends:
             report["charts/gentle_rate"] = np.mean([info["gentle"][i] for info, i in ends])
             endings = [info["termination"][i] for info, i in ends]
@@ -115,7 +120,8 @@ def evaluate(
 ) -> dict[str, float]:
     """Mean return and success rates in trials per diameter (other tasks: trials in all).
 
-    These are trials of the full task. They set diameter, difficulty and retry.
+    These are trials of the full task: `evaluate` sets diameter, difficulty and retry, whatever the
+    options say. Rates are shares in [0, 1].
     """
     crane = is_crane(env_id)
     if crane:

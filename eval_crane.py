@@ -13,6 +13,8 @@ always the same trial. Intervals are 95 % Wilson score intervals.
 
 import csv
 import json
+import os
+import re
 import sys
 import tempfile
 from collections import Counter
@@ -87,8 +89,8 @@ class Args:
     csv: Path | None = None
     """write one row a trial to this file, also after Ctrl-C; docs/compare.md has its columns"""
     json: bool = False
-    """print one JSON object and nothing else: one table, without pose errors unless asked for.
-    Its rates are shares in [0, 1]"""
+    """print one JSON object per policy, each on a line, and nothing else: one table, without pose
+    errors unless asked for. Its rates are shares in [0, 1]"""
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif instead of judging"""
     trial: Annotated[int, Range(0, 9_999)] = 0
@@ -108,13 +110,16 @@ class Args:
 def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """The task's id and options to judge on, with a warning where it is not the policy's own."""
     env_id = args.env_id or trained_on["env_id"]
+    asked = f"--env-id {env_id}" if args.env_id else f"the policy's task {env_id}"
     try:
         on_crane = crane_trials.is_crane(env_id)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name != env_id.partition(":")[0]:
+            raise  # of an import in the user's module
         ours = ", ".join(name for name in gymnasium.registry if name.startswith("ForestryCrane"))
-        raise SystemExit(f"--env-id {env_id}: {error}; of this repository: {ours}") from None
+        raise SystemExit(f"{asked}: {error}; of this repository: {ours}") from None
     if not on_crane:
-        raise SystemExit(f"--env-id {env_id} is not the crane")
+        raise SystemExit(f"{asked} is not the crane; name a task of CraneVectorEnv or a subclass")
     names = trained_on.keys() & crane_options.DEFAULTS.keys() - {"difficulty", "retry"}
     options = {} if args.env_id else {name: trained_on[name] for name in names}
     if "sensors" in trained_on:
@@ -123,20 +128,24 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     if args.policy == "scripted":
         options |= {"axes": "crane", "offset": "plus", "signed_yaw": args.signed_yaw}
     elif args.env_id and "sensors" in trained_on:
-        envs = make_envs(env_id, 1)
-        if trained_on["env_id"].split(":")[-1] != env_id.split(":")[-1]:
-            print(f"the policy was trained on {trained_on['env_id']}", file=sys.stderr)
-        for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed", "sensors"):
-            ours, theirs = envs.unwrapped.options[name], trained_on[name]
-            if ours != theirs:
-                print(f"the policy knows {name}={theirs!r}; {env_id} has {ours!r}", file=sys.stderr)
-        envs.close()
+        warn_of_differences(env_id, trained_on)
     return env_id, options
 
 
+def warn_of_differences(env_id: str, trained_on: dict[str, Any]) -> None:
+    """Say what a policy knows otherwise than the task has it."""
+    if trained_on["env_id"].split(":")[-1] != env_id.split(":")[-1]:
+        print(f"the policy was trained on {trained_on['env_id']}", file=sys.stderr)
+    registered = one_crane(env_id, {}).options
+    for name in ("signed_yaw", "axes", "offset", "frame_skip", "speed", "sensors"):
+        ours, theirs = registered[name], trained_on[name]
+        if ours != theirs:
+            print(f"the policy knows {name}={theirs!r}; {env_id} has {ours!r}", file=sys.stderr)
+
+
 def judge(policy: Any, env_id: str, options: dict, args: Args) -> Iterator[dict]:
-    """One record a trial: number, diameter, success, failure, time_to_reach (s), centre_miss (m),
-    CARE.
+    """Yields a record of each trial: diameter (m), trial (its number), success, failure,
+    time_to_reach (s), centre_miss (m), and the costs `crane_env.CARE`.
     """
     diameters, seeds = monte_carlo_trials(args.seed, args.trials, args.diameters)
     with tqdm(total=len(seeds), unit="trial", leave=False) as bar:
@@ -224,9 +233,9 @@ def mean_costs(trials: list[dict]) -> dict[str, float]:
     early would look cheap.
     """
     costs = {}
-    for head, key, factor, mean in CARE_COLUMNS:
+    for head, key, factor, average in CARE_COLUMNS:
         values = [r[key] for r in trials if key.startswith("ground") or r["success"]]
-        costs[head] = factor * mean(values).item() if values else np.nan
+        costs[head] = factor * average(values).item() if values else np.nan
     return costs
 
 
@@ -273,12 +282,12 @@ def write_csv(path: Path, records: list[dict]) -> None:
 
 
 def check_combinations(args: Args) -> None:
-    """SystemExit that names arguments that do not fit together or a file that cannot be written."""
+    """SystemExit that names arguments that do not fit together."""
     known = ("file", "scripted", "zero", "random")
     from_file, wrong_use = args.policy == "file", "goes with --policy file only"
     for wrong, message in [
         (
-            args.policy not in known and ":" not in args.policy,
+            args.policy not in known and not re.fullmatch(r"\w+(\.\w+)*:\w+", args.policy),
             f"--policy must be {', '.join(known)} or my_module:MyPolicy, got {args.policy!r}",
         ),
         (not args.diameters, "--diameters needs at least one number"),
@@ -293,19 +302,26 @@ def check_combinations(args: Args) -> None:
         (not from_file and args.stochastic, f"--stochastic {wrong_use}"),
         (
             args.stochastic and any(path.suffix == ".onnx" for path in args.path),
-            "--stochastic: an .onnx file has the mean action only",
+            "--stochastic: an .onnx file has the mean action only; judge its policy.pt",
         ),
         (
             args.policy != "scripted" and not args.signed_yaw,
             "--no-signed-yaw is for --policy scripted; a trained policy brings its own",
         ),
-        (args.video and args.viewer, "either --video or --viewer"),
+        (args.video and args.viewer, "choose --video or --viewer"),
         (
             (args.video or args.viewer) and (args.json or args.csv),
             "--video and --viewer judge nothing: --json and --csv have nothing to write",
         ),
-        (args.video and args.trials != 100, "--video films one trial per diameter; drop --trials"),
-        (args.trial and not (args.video or args.viewer), "--trial is for --video and --viewer"),
+        (
+            (args.video or args.viewer) and args.trials != Args.trials,
+            "--video and --viewer show single trials; drop --trials",
+        ),
+        (
+            (args.trial or args.camera != Args.camera) and not (args.video or args.viewer),
+            "--trial and --camera are for --video and --viewer",
+        ),
+        (args.width != Args.width and not args.video, "--width is for --video"),
         (
             args.video and args.video.suffix.lower() not in (".mp4", ".gif"),
             f"--video: {args.video} must end in .mp4 or .gif",
@@ -318,6 +334,10 @@ def check_combinations(args: Args) -> None:
     ]:
         if wrong:
             raise SystemExit(message)
+
+
+def check_files(args: Args) -> None:
+    """SystemExit that names a file that cannot be written."""
     for path in (args.video, args.csv):
         if path and not path.parent.is_dir():
             raise SystemExit(f"no folder {path.parent}; make it first")
@@ -346,67 +366,88 @@ def print_comparison(tables: dict[tuple[str, str, str], list[dict]]) -> None:
 
 def main() -> None:
     crane_runs.one_line_errors()
+    sys.path.insert(0, os.getcwd())  # of the user's policies, tasks and edited scripts
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     check_combinations(args)
+    check_files(args)
+    torch.set_num_threads(1)  # the batches are too small for more
+    policies = [policy_of(path, args) for path in args.path]  # all errors before the first trial
     tables = {}
-    for path in args.path:
-        for (env_id, noise), records in report(path, args).items():
-            judged = str(path) if args.policy == "file" else args.policy
-            tables[judged, env_id, noise] = records
+    for policy, name, source, env_id, options in policies:
+        if args.video or args.viewer:
+            torch.manual_seed(args.seed)
+            options["pose_noise"] = args.pose_noise or "none"
+            (film if args.video else show)(policy, name, env_id, options, args)
+        else:
+            tables |= report(policy, name, source, env_id, options, args)
     if tables and not args.json:
         print_comparison(tables)
-    print(end="", flush=True)
+    print(end="", flush=True)  # a closed pipe is met here and not when Python exits
 
 
-def report(path: Path, args: Args) -> dict[tuple[str, str], list[dict]]:
-    """Judge one policy and print its tables, or show it.
+def policy_of(path: Path, args: Args) -> tuple[Any, str, str, str, dict[str, Any]]:
+    """A policy, its name, where it comes from, and the id and options of the task to judge it on.
 
-    Returns the records of its trials, by task and pose noise. Without --policy file, path is
-    ignored.
+    Without --policy file, path is ignored.
     """
-    task = {"env_id": "ForestryCrane-v0"}
+    trained_on, name, source = {"env_id": "ForestryCrane-v0"}, args.policy, args.policy
     if args.policy == "file":
-        policy, task, name = load_policy(path)
+        policy, trained_on, name = load_policy(path)
         source = str(path)
-    elif ":" in args.policy:
-        policy, name, source = OwnPolicy(args.policy), "mine", args.policy
-    else:
+    elif args.policy in ("zero", "random"):
         policy = FixedPolicy(args.policy)
-        name = source = args.policy
-    env_id, options = task_of(args, task)
+    elif args.policy != "scripted":
+        policy, name = OwnPolicy(args.policy), "mine"
+    env_id, options = task_of(args, trained_on)
     options |= {"difficulty": 1.0, "retry": 0.0}  # all trials are of the full task
-    crane = make_envs(env_id, 1, **options).unwrapped
-    contact, registered = crane.options["contact"], make_envs(env_id, 1).unwrapped.options
-    # the title has two of these, the others change no trial
-    unimportant = {"contact", "difficulty", "pose_noise", "retry", "reward"}
-    changed = {
-        name: value
-        for name, value in crane.options.items()
-        if value != registered[name] and name not in unimportant
-    }
+    crane = one_crane(env_id, options)
+    if args.policy == "scripted":
+        policy = scripted_policy(crane)
     observed, wanted = crane.single_observation_space, getattr(policy, "observation_space", None)
     if wanted is not None and wanted.shape != observed.shape:  # of Stable-Baselines3
         raise SystemExit(f"{source} observes {wanted.shape}; {env_id} gives {observed.shape}")
-    if args.policy == "scripted":
-        if crane.dt != DT:
-            raise SystemExit(f"the scripted crane decides every {DT} s, not every {crane.dt} s")
-        if crane.options["speed"] != "real":
-            raise SystemExit("the scripted crane knows the speed limits of the real machine only")
-        settings = HYDRAULIC if crane.options["actuators"] == "hydraulic" else IDEAL
-        policy = ScriptedCrane(args.signed_yaw, settings)
-    torch.set_num_threads(1)  # the batches are too small for more
-    if args.video or args.viewer:
-        torch.manual_seed(args.seed)
-        options["pose_noise"] = args.pose_noise or "none"
-        (film if args.video else show)(policy, name, env_id, options, args)
-        return {}
+    return policy, name, source, env_id, options
 
-    all_records, tables = [], {}
+
+def one_crane(env_id: str, options: dict[str, Any]) -> crane_env.CraneVectorEnv:
+    """A closed crane, to look at its options and spaces."""
+    envs = make_envs(env_id, 1, **options)
+    envs.close()
+    return envs.unwrapped
+
+
+def scripted_policy(crane: crane_env.CraneVectorEnv) -> ScriptedCrane:
+    """The scripted crane with its settings for these drives. SystemExit if it cannot drive them."""
+    if crane.dt != DT:
+        raise SystemExit(f"the scripted crane decides every {DT} s, not every {crane.dt} s")
+    if crane.options["speed"] != "real":
+        raise SystemExit("the scripted crane knows the speed limits of the real machine only")
+    settings = HYDRAULIC if crane.options["actuators"] == "hydraulic" else IDEAL
+    return ScriptedCrane(crane.options["signed_yaw"], settings)
+
+
+def report(
+    policy: Any, name: str, source: str, env_id: str, options: dict[str, Any], args: Args
+) -> dict[tuple[str, str, str], list[dict]]:
+    """Judge a policy and print its tables. Returns the records of its trials, by source, task and
+    pose noise.
+    """
+    given, registered = one_crane(env_id, options).options, one_crane(env_id, {}).options
+    # the title has two of these, the others change no trial
+    unimportant = {"contact", "difficulty", "pose_noise", "retry", "reward"}
+    changed = {
+        option: value
+        for option, value in given.items()
+        if value != registered[option] and option not in unimportant
+    }
+    papers_task = env_id.split(":")[-1] in ("ForestryCrane-v0", "ForestryCranePaper-v0")
+    papers_task &= not changed
+    contact, all_records, tables = given["contact"], [], {}
     noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
     for noise in noises:
         torch.manual_seed(args.seed)
         options["pose_noise"] = noise
-        tables[env_id, noise] = records = []
+        tables[source, env_id, noise] = records = []
         try:
             for record in judge(policy, env_id, options, args):
                 records.append(record)
@@ -418,14 +459,12 @@ def report(path: Path, args: Args) -> dict[tuple[str, str], list[dict]]:
         if args.json:
             where = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
             print_json(records, cells, where | {"seed": args.seed, "changed": changed})
-        else:
-            what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
-            what += "".join(f", {option}={value!r}" for option, value in changed.items())
-            papers_task = env_id.split(":")[-1] in ("ForestryCrane-v0", "ForestryCranePaper-v0")
-            papers_task &= not changed
-            paper = PAPER.get(noise, {}) if papers_task else {}
-            title = TITLES[noise] if papers_task else "Trials"
-            print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")
+            continue
+        what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
+        what += "".join(f", {option}={value!r}" for option, value in changed.items())
+        paper = PAPER.get(noise, {}) if papers_task else {}
+        title = TITLES[noise] if papers_task else "Trials"
+        print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")
     return tables
 
 

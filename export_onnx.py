@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX: normalizer, mean action and memory in one file, without torch.
+"""Write a trained policy as ONNX. The file runs without torch.
 
     python export_onnx.py assets/policies/ppo_crane.pt ppo_crane.onnx
     python eval_crane.py ppo_crane.onnx
@@ -12,11 +12,14 @@ an episode; other policies have neither):
     actions, *after = session.run(None, {"obs": obs.astype("f4"), **memory})
     memory = dict(zip(memory, after))
 
-actions (N, 6) are those of `predict` for obs (N, 18 or 32), float32.
+The file has the normalizer, the mean action and the memory. actions (N, 6) are those of `predict`
+for obs (N, 18 or 32), float32.
 """
 
 import io
 import json
+import os
+import sys
 import warnings
 from pathlib import Path
 
@@ -54,7 +57,7 @@ class MeanAction(nn.Module):
 
 
 def main(policy: Positional[Path], file: Positional[Path]) -> None:
-    """Write the file.
+    """Write a policy as ONNX.
 
     Args:
         policy: a run's folder or a policy.pt
@@ -63,9 +66,10 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
     crane_runs.one_line_errors()
     if file.suffix != ".onnx":
         raise SystemExit(f"{file} must end in .onnx")
+    if policy.suffix in (".zip", ".onnx"):
+        raise SystemExit(f"{policy} is no policy.pt; give what a script of this repository trained")
+    sys.path.insert(0, os.getcwd())  # of edited scripts
     agent, task, name = crane_policies.load_policy(policy)
-    if not hasattr(agent, "obs_mean"):
-        raise SystemExit(f"{policy} is no policy.pt of this repository's scripts")
     obs = torch.zeros(2, agent.obs_mean.shape[0])
     state = agent.initial_state(2) if hasattr(agent, "initial_state") else ()
     inputs = ["obs", "h", "c"][: 1 + len(state)]
@@ -89,7 +93,7 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
         exported = crane_runs.fingerprint(crane_policies.OnnxPolicy(path), obs.shape[1])
         if not torch.allclose(exported, crane_runs.fingerprint(agent, obs.shape[1]), atol=1e-4):
             raise SystemExit(f"{policy}: its Agent has another `predict`; adapt MeanAction")
-    print(f"{name} written to {file}")
+    print(f"{policy} ({name}) is written to {file}")
 
 
 if __name__ == "__main__":

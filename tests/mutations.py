@@ -318,8 +318,15 @@ MUTATIONS = [
     Mutation(
         "a changed network is judged as if it were not",
         ("crane_policies.py",),
-        "if not torch.allclose(actions, expected, atol=1e-3):",
+        "if not same:",
         "if False:",
+        "test_eval -k edited",
+    ),
+    Mutation(
+        "an edited copy is judged under our name",
+        ("crane_policies.py",),
+        "algorithm if used in ours else used",
+        "algorithm",
         "test_eval -k edited",
     ),
     Mutation(

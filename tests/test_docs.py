@@ -165,6 +165,7 @@ def test_recipe_of_a_normalized_model(tmp_path, monkeypatch, capsys):
     cranes.save("statistics.pkl")
     code, _ = recipe(4)
     (tmp_path / "my_normalized.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
     obs = cranes.get_original_obs()
     expected = model.predict(cranes.normalize_obs(obs), deterministic=True)[0]
     actions = crane_policies.OwnPolicy("my_normalized:Normalized").predict(obs, None)[0]

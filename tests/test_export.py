@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import onnxruntime
@@ -54,7 +55,7 @@ def test_the_onnx_file_lifts_logs(tmp_path, capsys, monkeypatch):
 def test_the_command_writes_a_file(tmp_path):
     line = [sys.executable, ROOT / "export_onnx.py", crane_policies.SHIPPED, tmp_path / "a.onnx"]
     result = subprocess.run(line, capture_output=True, text=True)
-    assert result.returncode == 0 and "mppo_beta written to" in result.stdout
+    assert result.returncode == 0 and "(mppo_beta) is written to" in result.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
 
 
@@ -63,7 +64,6 @@ def test_an_agent_with_another_predict_is_not_exported(tmp_path, monkeypatch):
     predict = ppo_crane.Agent.predict
     half = lambda *args, **kwargs: (predict(*args, **kwargs)[0] / 2, None)  # noqa: E731
     monkeypatch.setattr(ppo_crane.Agent, "predict", half)
-    monkeypatch.setattr(crane_policies, "script_of", lambda saved, path: ppo_crane)
     path = ROOT / "assets" / "policies" / "ppo_crane.pt"
     saved = torch.load(path, weights_only=True)
     saved["fingerprint"] /= 2  # as of a run of the changed script
@@ -83,7 +83,7 @@ def test_a_model_of_stable_baselines3_is_judged(tmp_path, monkeypatch, name):
     policy, task, _ = crane_policies.load_policy(tmp_path / "model.zip")
     ours = evaluate(policy, task["env_id"], 1, 40_000)
     assert ours == evaluate(model, "ForestryCrane-v0", 1, 40_000)
-    with pytest.raises(SystemExit, match="model.zip is no policy.pt of this"):
+    with pytest.raises(SystemExit, match="model.zip is no policy.pt; give what"):
         export_onnx.main(tmp_path / "model.zip", tmp_path / "model.onnx")
     line = ["eval_crane.py", "model.zip", "--env-id", "ForestryCraneHydraulic-v0"]
     monkeypatch.setattr(sys, "argv", line)
@@ -93,12 +93,21 @@ def test_a_model_of_stable_baselines3_is_judged(tmp_path, monkeypatch, name):
         eval_crane.main()
 
 
-@pytest.mark.parametrize("kind", ["zip", "onnx"])
-def test_damaged_files_are_named(tmp_path, kind):
+@pytest.mark.parametrize(
+    "kind, said", [("zip", "is no model of Stable-Baselines3"), ("onnx", "is no ONNX file")]
+)
+def test_damaged_files_are_named(tmp_path, kind, said):
     path = tmp_path / f"policy.{kind}"
     path.write_bytes(b"junk")
-    with pytest.raises(SystemExit, match=f"policy.{kind}"):
+    with pytest.raises(SystemExit, match=f"policy.{kind} {said}"):
         crane_policies.load_policy(path)
+
+
+def test_a_zip_of_something_else_is_named(tmp_path):
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as file:
+        file.writestr("photo.txt", "a crane")
+    with pytest.raises(SystemExit, match="photos.zip is no model of Stable-Baselines3"):
+        crane_policies.load_policy(tmp_path / "photos.zip")
 
 
 def test_an_onnx_file_of_others_is_told_what_to_do(tmp_path):
