@@ -5,6 +5,9 @@
     python benchmark/rivals.py --rivals sb3_ppo sac --seeds 1   # some
     python benchmark/rivals.py --table                          # the table of what is there
 
+CleanRL is no package for this Python. Download cleanrl/ppo_continuous_action.py from its repository
+and put its folder on PYTHONPATH.
+
 Each run is a process of its own. Its clock starts with the process: imports and compilation count.
 The clock stops while a policy is judged. Every minute the mean action is judged in 120 trials of
 the full task, with the normalization of observations that the training has reached. If an update
@@ -17,6 +20,7 @@ Each rival has two settings. `published` is what its makers publish for continuo
   environments, SAC and TQC have one. sbx PPO has no gSDE.
 - sbx SAC: the example of sbx's README, the zoo's HalfCheetah with train_freq 4, gradient_steps 4.
 - rsl-rl PPO, skrl PPO: Isaac Lab's settings for lifting a cube, with 64 environments, not 4096.
+- CleanRL PPO: the defaults of its file, with one environment.
 
 `ours` is one try of ours, chosen before any result. It has the cranes and the reward scale of
 mppo_beta_crane.py: starts get harder in the first 0.4 of the time, and some repeat a failure.
@@ -24,7 +28,7 @@ mppo_beta_crane.py: starts get harder in the first 0.4 of the time, and some rep
 mppo_beta_crane.py runs with its defaults, and its time includes its start. Its schedules end after
 1,024,000 decisions, in 8 to 20 minutes on two cores. A run that needs longer is cut off. It saves a
 policy every 10 updates, so the judge sees a policy that is a little older than the clock says.
-CleanRL's PPO is not measured, because its package needs a Python older than 3.11.
+CleanRL's learning rate falls over a million decisions, too.
 """
 
 import csv
@@ -116,6 +120,11 @@ OUR_SKRL = dict(
     net=dict(layers=[256, 256], activations="tanh"), std=0.3, rollouts=64,
     learning_rate=1e-3, learning_rate_scheduler_kwargs=dict(kl_threshold=0.02),
     discount_factor=0.97, time_limit_bootstrap=True,
+)  # fmt: skip
+# the file has no arguments for the networks (2 x 64) and the policy's first std (1)
+OUR_CLEANRL = dict(
+    num_steps=64, num_minibatches=4, update_epochs=8, learning_rate=1e-3, gamma=0.97,
+    target_kl=0.04,
 )  # fmt: skip
 
 # ---- the clock
@@ -279,6 +288,43 @@ def train_skrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
     runner.trainer.train()
 
 
+def train_cleanrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
+    """CleanRL's file runs unchanged on our cranes.
+
+    Gymnasium's wrappers of a vector environment replace those of the file. They do the same, with
+    statistics that all cranes share.
+    """
+    from gymnasium.wrappers import vector as wrappers
+
+    class Cranes(TimedCranes):
+        def step(self, actions: np.ndarray) -> tuple:
+            return *super().step(actions)[:4], {}  # the file looks for its own wrappers' info
+
+    def bound(values: np.ndarray) -> np.ndarray:
+        return np.clip(values, -10, 10)
+
+    envs = normalized = wrappers.NormalizeObservation(wrappers.ClipAction(Cranes(setting, clock)))
+    envs = wrappers.TransformObservation(envs, bound)
+    if not setting.like_mppo:
+        envs = wrappers.TransformReward(wrappers.NormalizeReward(envs, gamma=0.99), bound)
+    gymnasium.vector.SyncVectorEnv = lambda *_, **__: envs
+    file = Path(find_spec("ppo_continuous_action").origin)
+    program = {"__name__": "__main__", "__file__": str(file)}
+
+    @torch.no_grad()
+    def act(obs: np.ndarray) -> np.ndarray:
+        mean, var = normalized.obs_rms.mean, normalized.obs_rms.var
+        seen = bound((obs - mean) / np.sqrt(var + normalized.epsilon))
+        return program["agent"].actor_mean(torch.as_tensor(seen).float()).clamp(-1, 1).numpy()
+
+    clock.act = act
+    sys.argv = [str(file), "--seed", str(seed), "--num-envs", str(setting.cranes), "--no-cuda"]
+    for name, value in setting.options.items():
+        sys.argv += [f"--{name}", str(value)]
+    exec(compile(file.read_text(), file, "exec"), program)
+    clock.judge(clock.seconds() / 60, clock.decisions)  # it ends after a million decisions
+
+
 def train_mppo(_: str, setting: Setting, seed: int, clock: Clock) -> None:
     """mppo_beta_crane.py in a process of its own. Copies of its policy are judged afterwards."""
     command = [sys.executable, str(ROOT / "mppo_beta_crane.py"), "--seed", str(seed)]
@@ -320,6 +366,7 @@ PUBLISHED = {
     "sbx_sac": Setting(SBX_SAC, cranes=1),
     "rsl_rl_ppo": Setting(RSL_RL),
     "skrl_ppo": Setting(SKRL),
+    "cleanrl_ppo": Setting({}, cranes=1),
 }
 LIKE_MPPO = dict(normalize=ONLY_OBS, like_mppo=True)
 OFF_POLICY = Setting(OUR_SAC, cranes=32, **LIKE_MPPO)
@@ -331,6 +378,7 @@ OURS = {
     "sbx_sac": OFF_POLICY,
     "rsl_rl_ppo": Setting(OUR_RSL_RL, like_mppo=True),
     "skrl_ppo": Setting(OUR_SKRL, like_mppo=True),
+    "cleanrl_ppo": Setting(OUR_CLEANRL, like_mppo=True),
 }
 SETTINGS = {"published": PUBLISHED, "ours": OURS}
 RIVALS = {  # how to train, and the package that it needs, with the class
@@ -342,6 +390,7 @@ RIVALS = {  # how to train, and the package that it needs, with the class
     "sbx_sac": (train_sb3, "sbx:SAC"),
     "rsl_rl_ppo": (train_rsl_rl, "rsl_rl"),
     "skrl_ppo": (train_skrl, "skrl"),
+    "cleanrl_ppo": (train_cleanrl, "ppo_continuous_action"),
 }
 
 
@@ -392,6 +441,8 @@ def run_all(args: Args) -> None:
     for name in sorted(missing):
         mend = "pip install -r benchmark/rivals-requirements.txt torch=="
         mend += torch.__version__.partition("+")[0]  # so that pip keeps this torch
+        if name == "cleanrl_ppo":
+            mend = "download CleanRL's file, and put its folder on PYTHONPATH"
         print(f"{name} needs {packages[name]}, which is missing: {mend}", flush=True)
     common = ["--minutes", str(args.minutes), "--threads", str(args.threads)]
     common += ["--results", str(args.results.resolve())]

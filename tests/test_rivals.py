@@ -3,8 +3,10 @@
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+import torch
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "benchmark"))
@@ -61,6 +63,55 @@ def test_the_cranes_of_our_settings_get_harder_with_the_time(now):
     assert plain.unwrapped.difficulty == 1.0
     np.testing.assert_allclose(scaled, 0.06 * full)
     assert clock.decisions == 4
+
+
+CLEANRL = """
+import sys
+import gymnasium as gym
+import numpy as np
+import torch
+
+class Agent:
+    actor_mean = torch.nn.Linear(18, 6)
+
+agent, envs = Agent(), gym.vector.SyncVectorEnv([], autoreset_mode=None)
+envs.reset(seed=1)
+for _ in range(3):
+    obs, reward, *_, infos = envs.step(np.full((2, 6), 3.0))
+obs = torch.as_tensor(obs).float()
+said = dict(agent=agent.actor_mean(obs), obs=obs, infos=infos, words=sys.argv[1:])
+torch.save(said, "said.pt")
+"""
+
+
+def test_cleanrls_file_runs_on_the_cranes(tmp_path, monkeypatch, now):
+    """The judge normalizes as the program does, and sees its networks."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setattr(gymnasium.vector, "SyncVectorEnv", None)  # to have it back afterwards
+    (tmp_path / "ppo_continuous_action.py").write_text(CLEANRL)
+    raw, judged, step = [], [], rivals.TimedCranes.step
+
+    def watched(cranes, actions):
+        assert np.abs(actions).max() == 1  # clipped
+        raw.append(step(cranes, actions)[0])
+        return raw[-1], np.ones(2), np.zeros(2, bool), np.zeros(2, bool), {"ground": 1}
+
+    def judge(policy, *_):
+        judged.append(policy.predict(raw[-1])[0])
+        return {"success_rate": 0.0, "gentle_rate": 0.0}
+
+    monkeypatch.setattr(rivals.TimedCranes, "step", watched)
+    monkeypatch.setattr(rivals.crane_trials, "evaluate", judge)
+    clock = rivals.Clock(started=1000.0, limit=100.0, threads=1)
+    setting = rivals.Setting({"num_steps": 64}, cranes=2, like_mppo=True)
+    rivals.train_cleanrl("", setting, 7, clock)
+    said = torch.load("said.pt", weights_only=True)
+    assert said["infos"] == {}
+    assert said["words"] == "--seed 7 --num-envs 2 --no-cuda --num_steps 64".split()
+    assert not np.allclose(said["obs"], raw[-1])  # normalized
+    np.testing.assert_allclose(judged[0], said["agent"].detach().clamp(-1, 1), atol=1e-6)
 
 
 def test_every_setting_has_a_rival():

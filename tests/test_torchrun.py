@@ -107,10 +107,11 @@ def test_a_killed_rank_ends_the_run_and_any_number_of_ranks_goes_on(tmp_path):
     assert SCRIPT.name not in "".join(re.findall(r'File "(.*)"', errors))  # no traceback of ours
     folder = only_run(tmp_path)
     done = torch.load(folder / "checkpoint.pt", weights_only=True)["iteration"]
-    line = [SCRIPT, "--resume", folder, "--total-timesteps", 64 * (done + 1)]
-    result = torchrun(tmp_path, *line, ranks=1)
-    assert result.returncode == 0, result.stderr
-    done += 1
+    for ranks in (1, 2):
+        done += 1
+        line = [SCRIPT, "--resume", folder, "--total-timesteps", 64 * done]
+        result = torchrun(tmp_path, *line, ranks=ranks)
+        assert result.returncode == 0, result.stderr
     assert scalars(folder)["time/updates"] == list(range(1, done + 1))
 
 
