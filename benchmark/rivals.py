@@ -24,6 +24,7 @@ Each rival has two settings. `published` is what its makers publish for continuo
 
 `ours` is one try of ours, chosen before any result. It has the cranes and the reward scale of
 mppo_beta_crane.py: starts get harder in the first 0.4 of the time, and some repeat a failure.
+CleanRL's file scales the reward itself.
 
 mppo_beta_crane.py runs with its defaults, and its time includes its start. Its schedules end after
 1,024,000 decisions, in 8 to 20 minutes on two cores. A run that needs longer is cut off. It saves a
@@ -53,6 +54,7 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
+from gymnasium.vector import AutoresetMode
 from torch import nn
 
 import crane_options
@@ -289,37 +291,45 @@ def train_skrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
 
 
 def train_cleanrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
-    """CleanRL's file runs unchanged on our cranes.
+    """CleanRL's file runs unchanged, but its vector of environments looks at the clock.
 
-    Gymnasium's wrappers of a vector environment replace those of the file. They do the same, with
-    statistics that all cranes share.
+    The file is written for Gymnasium 0.29. Gymnasium 1 resets in another step unless told
+    otherwise, reports ends in another way, and wants the space of a transformed observation.
     """
-    from gymnasium.wrappers import vector as wrappers
+    make_vector, task = gymnasium.vector.SyncVectorEnv, TASK
+    transform = gymnasium.wrappers.TransformObservation
+    if setting.like_mppo:
+        task, retry = "RetryCrane-v0", {"retry": 0.5}
+        gymnasium.register(task, entry_point="crane_env:CraneEnv", kwargs=retry)
 
-    class Cranes(TimedCranes):
+    class Cranes(gymnasium.vector.VectorWrapper):
+        def __init__(self, makers: list, **_):
+            super().__init__(make_vector(makers, autoreset_mode=AutoresetMode.SAME_STEP))
+
         def step(self, actions: np.ndarray) -> tuple:
-            return *super().step(actions)[:4], {}  # the file looks for its own wrappers' info
+            clock.tick()
+            if setting.like_mppo:
+                self.env.set_attr("difficulty", min(1.0, clock.share() / 0.4))
+            clock.decisions += self.num_envs
+            return *self.env.step(actions)[:4], {}
 
-    def bound(values: np.ndarray) -> np.ndarray:
-        return np.clip(values, -10, 10)
-
-    envs = normalized = wrappers.NormalizeObservation(wrappers.ClipAction(Cranes(setting, clock)))
-    envs = wrappers.TransformObservation(envs, bound)
-    if not setting.like_mppo:
-        envs = wrappers.TransformReward(wrappers.NormalizeReward(envs, gamma=0.99), bound)
-    gymnasium.vector.SyncVectorEnv = lambda *_, **__: envs
     file = Path(find_spec("ppo_continuous_action").origin)
     program = {"__name__": "__main__", "__file__": str(file)}
 
     @torch.no_grad()
     def act(obs: np.ndarray) -> np.ndarray:
-        mean, var = normalized.obs_rms.mean, normalized.obs_rms.var
-        seen = bound((obs - mean) / np.sqrt(var + normalized.epsilon))
-        return program["agent"].actor_mean(torch.as_tensor(seen).float()).clamp(-1, 1).numpy()
+        seen = [env.get_wrapper_attr("obs_rms") for env in program["envs"].env.envs]
+        mean, var = (np.mean([getattr(s, name) for s in seen], axis=0) for name in ("mean", "var"))
+        obs = torch.as_tensor(np.clip((obs - mean) / np.sqrt(var + 1e-8), -10, 10))
+        return program["agent"].actor_mean(obs.float()).clamp(-1, 1).numpy()
 
     clock.act = act
-    sys.argv = [str(file), "--seed", str(seed), "--num-envs", str(setting.cranes), "--no-cuda"]
-    for name, value in setting.options.items():
+    gymnasium.vector.SyncVectorEnv = Cranes
+    gymnasium.wrappers.TransformObservation = lambda env, function: transform(
+        env, function, env.observation_space
+    )
+    sys.argv = [str(file), "--env-id", task, "--seed", str(seed), "--no-cuda"]
+    for name, value in {"num_envs": setting.cranes, **setting.options}.items():
         sys.argv += [f"--{name}", str(value)]
     exec(compile(file.read_text(), file, "exec"), program)
     clock.judge(clock.seconds() / 60, clock.decisions)  # it ends after a million decisions

@@ -13,6 +13,8 @@ sys.path.insert(0, str(ROOT / "benchmark"))
 
 import rivals  # noqa: E402
 
+from crane_env import CraneEnv  # noqa: E402
+
 
 @pytest.fixture
 def now(monkeypatch):
@@ -74,12 +76,17 @@ import torch
 class Agent:
     actor_mean = torch.nn.Linear(18, 6)
 
-agent, envs = Agent(), gym.vector.SyncVectorEnv([], autoreset_mode=None)
+def make():
+    env = gym.wrappers.NormalizeObservation(gym.make(sys.argv[2]))
+    return gym.wrappers.TransformObservation(env, lambda obs: np.clip(obs, -10, 10))
+
+agent, envs = Agent(), gym.vector.SyncVectorEnv([make])
 envs.reset(seed=1)
 for _ in range(3):
-    obs, reward, *_, infos = envs.step(np.full((2, 6), 3.0))
-obs = torch.as_tensor(obs).float()
-said = dict(agent=agent.actor_mean(obs), obs=obs, infos=infos, words=sys.argv[1:])
+    obs, *_, infos = envs.step(np.full((1, 6), 0.5))
+actions = agent.actor_mean(torch.as_tensor(obs).float())
+crane = envs.unwrapped.envs[0].unwrapped
+said = dict(actions=actions, infos=infos, words=sys.argv[1:], difficulty=crane.difficulty)
 torch.save(said, "said.pt")
 """
 
@@ -89,29 +96,31 @@ def test_cleanrls_file_runs_on_the_cranes(tmp_path, monkeypatch, now):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "argv", sys.argv)
-    monkeypatch.setattr(gymnasium.vector, "SyncVectorEnv", None)  # to have it back afterwards
+    # to have them back afterwards
+    monkeypatch.setattr(gymnasium.vector, "SyncVectorEnv", gymnasium.vector.SyncVectorEnv)
+    transform = gymnasium.wrappers.TransformObservation
+    monkeypatch.setattr(gymnasium.wrappers, "TransformObservation", transform)
     (tmp_path / "ppo_continuous_action.py").write_text(CLEANRL)
-    raw, judged, step = [], [], rivals.TimedCranes.step
+    raw, judged, step = [], [], CraneEnv.step
 
-    def watched(cranes, actions):
-        assert np.abs(actions).max() == 1  # clipped
-        raw.append(step(cranes, actions)[0])
-        return raw[-1], np.ones(2), np.zeros(2, bool), np.zeros(2, bool), {"ground": 1}
+    def watched(crane, action):
+        raw.append(step(crane, action))
+        return raw[-1]
 
     def judge(policy, *_):
-        judged.append(policy.predict(raw[-1])[0])
+        judged.append(policy.predict(raw[-1][0][None])[0])
         return {"success_rate": 0.0, "gentle_rate": 0.0}
 
-    monkeypatch.setattr(rivals.TimedCranes, "step", watched)
+    monkeypatch.setattr(CraneEnv, "step", watched)
     monkeypatch.setattr(rivals.crane_trials, "evaluate", judge)
-    clock = rivals.Clock(started=1000.0, limit=100.0, threads=1)
-    setting = rivals.Setting({"num_steps": 64}, cranes=2, like_mppo=True)
+    clock = rivals.Clock(started=980.0, limit=100.0, threads=1)  # half of the easy time is over
+    setting = rivals.Setting({"num_steps": 64}, cranes=1, like_mppo=True)
     rivals.train_cleanrl("", setting, 7, clock)
     said = torch.load("said.pt", weights_only=True)
-    assert said["infos"] == {}
-    assert said["words"] == "--seed 7 --num-envs 2 --no-cuda --num_steps 64".split()
-    assert not np.allclose(said["obs"], raw[-1])  # normalized
-    np.testing.assert_allclose(judged[0], said["agent"].detach().clamp(-1, 1), atol=1e-6)
+    words = "--env-id RetryCrane-v0 --seed 7 --no-cuda --num_envs 1 --num_steps 64"
+    assert (said["infos"], said["words"], said["difficulty"]) == ({}, words.split(), 0.5)
+    assert clock.rows == [[0.33, 3, 0.0, 0.0]]
+    np.testing.assert_allclose(judged[0], said["actions"].detach().clamp(-1, 1), atol=1e-6)
 
 
 def test_every_setting_has_a_rival():
