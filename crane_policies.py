@@ -1,5 +1,6 @@
 """Policies to judge: what a file holds, a class of your own, or fixed actions.
 
+    from pathlib import Path
     from crane_policies import load_policy
 
     policy, task, name = load_policy(Path("runs/<run>"))

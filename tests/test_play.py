@@ -73,7 +73,7 @@ def test_the_page_runs_in_a_browser():
     address = f"http://127.0.0.1:{server.server_port}/docs/play/#policy"
     flags = ["--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
     flags += ["--enable-unsafe-swiftshader", "--window-size=320,240"]
-    flags += ["--virtual-time-budget=15000", "--timeout=60000", "--dump-dom", address]
+    flags += ["--virtual-time-budget=60000", "--timeout=150000", "--dump-dom", address]
     try:
         ran = subprocess.run([CHROMIUM, *flags], capture_output=True, text=True, timeout=180)
     finally:
