@@ -55,7 +55,7 @@ def make_envs(
         envs = gymnasium.make_vec(env_id, num_envs, "sync", vector_kwargs=autoreset)
     for space in (envs.single_observation_space, envs.single_action_space):
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            raise OptionError(f"{env_id}: observations or actions are no flat Box")
+            raise OptionError("its observations or actions are no flat Box")
     return RecordEpisodeStatistics(envs)
 
 
