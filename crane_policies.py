@@ -102,21 +102,20 @@ def load_agent(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     used = Path(script.__file__).name
     task = crane_options.DEFAULTS | task  # an option that is newer than the file has its default
     warn_of_revision(path, task)
+    mend = f"undo the change of {used} or train again"
+    if wrote not in ("", used):
+        mend = f"{wrote} wrote it; copy {wrote}, with its Agent, here"
     try:
         obs_dim, low, high = (saved["spaces"][name] for name in ("obs_dim", "low", "high"))
         agent = script.Agent(obs_dim, low.numpy(), high.numpy(), script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
-        actions = crane_runs.fingerprint(agent, obs_dim)
-        same = torch.allclose(actions, expected, atol=1e-3)
+        expected = torch.as_tensor(expected)
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
-        mend = "judge it with the script that wrote it"
         raise SystemExit(f"{path} does not fit {used}: {reason}; {mend}") from None
-    if not same:
-        mend = f"undo the change of {used} or train again"
-        if wrote not in ("", used):
-            mend = f"{wrote} wrote it; copy {wrote}, with its Agent, here"
+    actions = crane_runs.fingerprint(agent, obs_dim)
+    if actions.shape != expected.shape or not torch.allclose(actions, expected, atol=1e-3):
         told = f"the Agent of {script.__file__} acts otherwise than in the training"
         raise SystemExit(f"{path}: {told}; {mend}")
     ours = (f"{algorithm}_crane.py", "mppo_beta_torchrun.py")
@@ -233,7 +232,10 @@ class OwnPolicy:
             raise SystemExit(f"--policy {self.policy}: {given}")
         if isinstance(actions, torch.Tensor):
             actions = actions.detach().cpu()
-        actions = np.asarray(actions)
+        try:
+            actions = np.asarray(actions)
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise SystemExit(f"--policy {self.policy}: actions are no array: {error}") from None
         if actions.dtype.kind not in "fiu" or actions.shape != (len(obs), 6):
             wanted = f"numbers ({len(obs)}, 6) for observations {obs.shape}"
             given = f"actions must be {wanted}, got {actions.dtype} {actions.shape}"

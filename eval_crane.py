@@ -114,8 +114,10 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
     try:
         on_crane = crane_trials.is_crane(env_id)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
-        if isinstance(error, ModuleNotFoundError) and error.name != env_id.partition(":")[0]:
-            raise  # of an import in the user's module
+        module = env_id.rpartition(":")[0]
+        missing = getattr(error, "name", None) or module
+        if not f"{module}.".startswith(f"{missing}."):  # of an import in the user's module
+            raise
         ours = ", ".join(name for name in gymnasium.registry if name.startswith("ForestryCrane"))
         raise SystemExit(f"{asked}: {error}; of this repository: {ours}") from None
     if not on_crane:

@@ -1,12 +1,12 @@
 """What a user would pick instead, measured on the same cranes: 10 minutes each on two cores.
 
     pip install -r requirements.txt -r benchmark/rivals-requirements.txt
-    python benchmark/rivals.py                                  # all, about 8 hours
+    python benchmark/rivals.py                                  # all, about 10 hours
     python benchmark/rivals.py --rivals sb3_ppo sac --seeds 1   # some
     python benchmark/rivals.py --table                          # the table of what is there
 
-CleanRL is no package for this Python. Download cleanrl/ppo_continuous_action.py from its repository
-and put its folder on PYTHONPATH.
+CleanRL's package needs a Python older than 3.11. Download cleanrl/ppo_continuous_action.py from its
+repository (commit fe8d8a0) and put the absolute path of its folder on PYTHONPATH.
 
 Each run is a process of its own. Its clock starts with the process: imports and compilation count.
 The clock stops while a policy is judged. Every minute the mean action is judged in 120 trials of
@@ -29,7 +29,8 @@ CleanRL's file scales the reward itself.
 mppo_beta_crane.py runs with its defaults, and its time includes its start. Its schedules end after
 1,024,000 decisions, in 8 to 20 minutes on two cores. A run that needs longer is cut off. It saves a
 policy every 10 updates, so the judge sees a policy that is a little older than the clock says.
-CleanRL's learning rate falls over a million decisions, too.
+
+The learning rate of CleanRL's file falls over a million decisions.
 """
 
 import csv
@@ -452,7 +453,7 @@ def run_all(args: Args) -> None:
         mend = "pip install -r benchmark/rivals-requirements.txt torch=="
         mend += torch.__version__.partition("+")[0]  # so that pip keeps this torch
         if name == "cleanrl_ppo":
-            mend = "download CleanRL's file, and put its folder on PYTHONPATH"
+            mend = "download CleanRL's file; put the absolute path of its folder on PYTHONPATH"
         print(f"{name} needs {packages[name]}, which is missing: {mend}", flush=True)
     common = ["--minutes", str(args.minutes), "--threads", str(args.threads)]
     common += ["--results", str(args.results.resolve())]

@@ -318,7 +318,7 @@ MUTATIONS = [
     Mutation(
         "a changed network is judged as if it were not",
         ("crane_policies.py",),
-        "if not same:",
+        "if actions.shape != expected.shape or not torch.allclose(actions, expected, atol=1e-3):",
         "if False:",
         "test_eval -k edited",
     ),
