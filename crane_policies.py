@@ -92,7 +92,8 @@ def load_agent(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         algorithm, task = str(saved["algorithm"]), dict(saved["task"])
-        weights, args, expected = saved["weights"], dict(saved["args"]), saved["fingerprint"]
+        weights, args = saved["weights"], dict(saved["args"])
+        expected = torch.as_tensor(saved["fingerprint"])
         wrote = Path(saved.get("script", "")).name  # older files do not name it
     except Exception:  # a damaged file raises many kinds
         raise SystemExit(f"{path} is no policy.pt of this repository") from None
@@ -110,7 +111,6 @@ def load_agent(path: Path) -> tuple[torch.nn.Module, dict[str, Any], str]:
         agent = script.Agent(obs_dim, low.numpy(), high.numpy(), script.Args(**args))
         # policy.pt has no critic, and acting needs none
         agent.load_state_dict({**agent.critic.state_dict(prefix="critic."), **weights})
-        expected = torch.as_tensor(expected)
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [repr(error)])[-1].strip()
         raise SystemExit(f"{path} does not fit {used}: {reason}; {mend}") from None
@@ -140,7 +140,7 @@ def load_sb3(path: Path) -> Any:
         policy.load_state_dict(weights["policy"])
         scaled = data.get("_last_original_obs") is not None
     except ImportError as error:
-        raise SystemExit(f"{path}: {error}; install Stable-Baselines3 (docs/compare.md)") from None
+        raise SystemExit(f"{path}: {error}; install what it needs (docs/compare.md)") from None
     except Exception as error:  # a damaged file, a model of another version
         raise SystemExit(f"{path} is no model of Stable-Baselines3: {error}") from None
     if scaled:
@@ -191,6 +191,11 @@ class FixedPolicy:
         return 2 * torch.rand(len(obs), 6).numpy() - 1, None
 
 
+def is_missing(module: str, error: ModuleNotFoundError) -> bool:
+    """Whether the module itself is missing, or a package that it is in, and not what it imports."""
+    return f"{module}.".startswith(f"{error.name}.")
+
+
 class OwnPolicy:
     """A user's policy as `run_trials` wants it. SystemExit says what is wrong with it.
 
@@ -205,7 +210,7 @@ class OwnPolicy:
         try:
             found = importlib.import_module(module)
         except ModuleNotFoundError as error:
-            if not f"{module}.".startswith(f"{error.name}."):  # of an import in the user's module
+            if not is_missing(module, error):
                 raise
             raise SystemExit(f"--policy {policy}: {error}") from None
         if not hasattr(found, attribute):

@@ -35,7 +35,7 @@ import crane_options
 import crane_runs
 import crane_trials
 from crane_options import Range, Seed, Threads
-from crane_policies import SHIPPED, FixedPolicy, OwnPolicy, load_policy
+from crane_policies import SHIPPED, FixedPolicy, OwnPolicy, is_missing, load_policy
 from crane_task import CONDITIONS, D_MAX, D_MIN, DIAMETERS
 from crane_trials import make_envs, monte_carlo_trials, run_trials
 from crane_view import film, show, whole_file
@@ -115,8 +115,7 @@ def task_of(args: Args, trained_on: dict[str, Any]) -> tuple[str, dict[str, Any]
         on_crane = crane_trials.is_crane(env_id)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         module = env_id.rpartition(":")[0]
-        missing = getattr(error, "name", None) or module
-        if not f"{module}.".startswith(f"{missing}."):  # of an import in the user's module
+        if isinstance(error, ModuleNotFoundError) and not is_missing(module, error):
             raise
         ours = ", ".join(name for name in gymnasium.registry if name.startswith("ForestryCrane"))
         raise SystemExit(f"{asked}: {error}; of this repository: {ours}") from None
@@ -368,7 +367,7 @@ def print_comparison(tables: dict[tuple[str, str, str], list[dict]]) -> None:
 
 def main() -> None:
     crane_runs.one_line_errors()
-    sys.path.insert(0, os.getcwd())  # of the user's policies, tasks and edited scripts
+    sys.path.insert(0, os.getcwd())  # where the user's policies, tasks and edited scripts are
     args = tyro.cli(Args, description=__doc__.partition("\n\n")[0])
     check_combinations(args)
     check_files(args)

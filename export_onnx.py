@@ -68,7 +68,7 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
         raise SystemExit(f"{file} must end in .onnx")
     if policy.suffix in (".zip", ".onnx"):
         raise SystemExit(f"{policy} is no policy.pt; give what a script of this repository trained")
-    sys.path.insert(0, os.getcwd())  # of edited scripts
+    sys.path.insert(0, os.getcwd())  # where edited scripts are
     agent, task, name = crane_policies.load_policy(policy)
     obs = torch.zeros(2, agent.obs_mean.shape[0])
     state = agent.initial_state(2) if hasattr(agent, "initial_state") else ()

@@ -3,15 +3,17 @@
     python benchmark/make_runs.py curves      # four algorithms, three seeds; 1.5 to 2 hours
     python benchmark/make_runs.py levels      # the same on the two harder levels; 12 hours
     python benchmark/make_runs.py ablations   # mPPO with one thing changed, two seeds; 2 to 3 hours
+    python benchmark/make_runs.py short       # mPPO with half of the decisions, three seeds; 0.5 h
     python benchmark/make_runs.py timed       # mPPO, one at a time: three seeds of the ideal level,
                                               # one of each harder level; 1.5 hours
 
 Two trainings run at a time, with one thread each. The timed runs train alone, with two threads.
-The runs of curves and levels are then judged in 600 trials of seed 60000: evaluations.csv.
+The runs of curves, levels and short are then judged in 600 trials of seed 60000: evaluations.csv.
 
 Run the script again to go on. It skips each run that has a CSV file in benchmark/curves/, levels/,
-ablations/ or timed/. It resumes an interrupted run from its checkpoint in benchmark/runs/. To make
-a run again, delete both. After a change of the task or of a default, delete all of benchmark/runs/.
+ablations/, short/ or timed/. It resumes an interrupted run from its checkpoint in benchmark/runs/.
+To make a run again, delete both. After a change of the task or of a default, delete all of
+benchmark/runs/.
 """
 
 import csv
@@ -105,7 +107,7 @@ def make(folder: str, script: str, name: str, seed: int, flags: list[str], threa
     Path(log.name).unlink()
     csv_path.parent.mkdir(exist_ok=True)
     run = max(HERE.glob(f"runs/*__{run_name}__{seed}__*"))
-    if folder in ("curves", "levels"):
+    if folder in ("curves", "levels", "short"):
         evaluate(run_name, seed, run)
     export(run, csv_path)
     return f"{csv_path.name} written"
@@ -149,7 +151,7 @@ def level_job(script: str, level: str, seed: int, flags: list[str], threads: int
     return script, f"{script}_{level.lower()}", seed, flags, threads
 
 
-def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) -> None:
+def main(what: Positional[Literal["curves", "levels", "ablations", "short", "timed"]]) -> None:
     if what == "curves":
         jobs = [(name, name, seed, [], 1) for seed in (1, 2, 3) for name in SCRIPTS]
     elif what == "levels":
@@ -159,6 +161,9 @@ def main(what: Positional[Literal["curves", "levels", "ablations", "timed"]]) ->
             for level in LEVELS
             for name in SCRIPTS
         ]
+    elif what == "short":
+        half = ["--total-timesteps", "512000", "--eval-every", "8"]
+        jobs = [(SCRIPTS[0], SCRIPTS[0], seed, half, 1) for seed in (1, 2, 3)]
     elif what == "timed":
         exact = ["--eval-trials", "100"]
         jobs = [(SCRIPTS[0], SCRIPTS[0], seed, exact, 2) for seed in (1, 2, 3)]

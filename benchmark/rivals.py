@@ -24,13 +24,11 @@ Each rival has two settings. `published` is what its makers publish for continuo
 
 `ours` is one try of ours, chosen before any result. It has the cranes and the reward scale of
 mppo_beta_crane.py: starts get harder in the first 0.4 of the time, and some repeat a failure.
-CleanRL's file scales the reward itself.
+CleanRL's file scales the reward itself, and its learning rate falls over a million decisions.
 
 mppo_beta_crane.py runs with its defaults, and its time includes its start. Its schedules end after
 1,024,000 decisions, in 8 to 20 minutes on two cores. A run that needs longer is cut off. It saves a
 policy every 10 updates, so the judge sees a policy that is a little older than the clock says.
-
-The learning rate of CleanRL's file falls over a million decisions.
 """
 
 import csv
@@ -292,10 +290,11 @@ def train_skrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
 
 
 def train_cleanrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
-    """CleanRL's file runs unchanged, but its vector of environments looks at the clock.
+    """CleanRL's file is not edited. The vector of environments that it gets looks at the clock.
 
-    The file is written for Gymnasium 0.29. Gymnasium 1 resets in another step unless told
-    otherwise, reports ends in another way, and wants the space of a transformed observation.
+    The file is written for Gymnasium 0.29. Here Gymnasium 1 resets a crane in the step that ends
+    its episode, as 0.29 did. `info` is left empty, because the file reads that of 0.29. A
+    transformed observation keeps its space, which the file does not give.
     """
     make_vector, task = gymnasium.vector.SyncVectorEnv, TASK
     transform = gymnasium.wrappers.TransformObservation
@@ -332,7 +331,7 @@ def train_cleanrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
     sys.argv = [str(file), "--env-id", task, "--seed", str(seed), "--no-cuda"]
     for name, value in {"num_envs": setting.cranes, **setting.options}.items():
         sys.argv += [f"--{name}", str(value)]
-    exec(compile(file.read_text(), file, "exec"), program)
+    exec(compile(file.read_text(), file, "exec"), program)  # act needs the program's variables
     clock.judge(clock.seconds() / 60, clock.decisions)  # it ends after a million decisions
 
 

@@ -1,11 +1,13 @@
 """export_onnx.py, and models of Stable-Baselines3, as eval_crane.py judges them."""
 
+import json
 import re
 import subprocess
 import sys
 import zipfile
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import stable_baselines3
@@ -125,6 +127,17 @@ def test_an_onnx_file_of_others_is_told_what_to_do(tmp_path):
     onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), path)
     with pytest.raises(SystemExit, match="not of export_onnx.py.*--policy my_module:MyPolicy"):
         crane_policies.load_policy(path)
+
+
+def test_an_option_that_is_newer_than_the_file_has_its_default(tmp_path):
+    path = tmp_path / "policy.onnx"
+    export_onnx.main(crane_policies.SHIPPED, path)
+    _, task, _ = crane_policies.load_policy(path)
+    model = onnx.load(path)
+    older = {"algorithm": "ppo", "task": json.dumps({k: task[k] for k in task if k != "speed"})}
+    onnx.helper.set_model_props(model, older)
+    onnx.save(model, path)
+    assert crane_policies.load_policy(path)[1] == task and task["speed"] == "real"
 
 
 def test_the_files_name_is_checked_first(tmp_path):

@@ -84,23 +84,35 @@ agent, envs = Agent(), gym.vector.SyncVectorEnv([make])
 envs.reset(seed=1)
 for _ in range(3):
     obs, *_, infos = envs.step(np.full((1, 6), 0.5))
-actions = agent.actor_mean(torch.as_tensor(obs).float())
+with torch.no_grad():
+    agent.actor_mean.weight.mul_(20)
+    actions = agent.actor_mean(torch.as_tensor(obs).float())
 crane = envs.unwrapped.envs[0].unwrapped
 said = dict(actions=actions, infos=infos, words=sys.argv[1:], difficulty=crane.difficulty)
+said |= dict(retry=crane.envs.options["retry"], mode=envs.unwrapped.metadata["autoreset_mode"].name)
 torch.save(said, "said.pt")
 """
 
 
-def test_cleanrls_file_runs_on_the_cranes(tmp_path, monkeypatch, now):
-    """The judge normalizes as the program does, and sees its networks."""
+@pytest.fixture
+def cleanrl(tmp_path, monkeypatch, now):
+    """Trains with a stand-in of CleanRL's file. Gymnasium is as before afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "argv", sys.argv)
-    # to have them back afterwards
-    monkeypatch.setattr(gymnasium.vector, "SyncVectorEnv", gymnasium.vector.SyncVectorEnv)
-    transform = gymnasium.wrappers.TransformObservation
-    monkeypatch.setattr(gymnasium.wrappers, "TransformObservation", transform)
+    for module, name in [
+        (gymnasium.vector, "SyncVectorEnv"),
+        (gymnasium.wrappers, "TransformObservation"),
+    ]:
+        monkeypatch.setattr(module, name, getattr(module, name))
     (tmp_path / "ppo_continuous_action.py").write_text(CLEANRL)
+    setting = rivals.Setting({"num_steps": 64}, cranes=1, like_mppo=True)
+    yield lambda clock: rivals.train_cleanrl("", setting, 7, clock)
+    gymnasium.registry.pop("RetryCrane-v0")
+
+
+def test_cleanrls_file_runs_on_the_cranes(monkeypatch, cleanrl):
+    """The judge normalizes as the program does, and sees its networks."""
     raw, judged, step = [], [], CraneEnv.step
 
     def watched(crane, action):
@@ -114,13 +126,21 @@ def test_cleanrls_file_runs_on_the_cranes(tmp_path, monkeypatch, now):
     monkeypatch.setattr(CraneEnv, "step", watched)
     monkeypatch.setattr(rivals.crane_trials, "evaluate", judge)
     clock = rivals.Clock(started=980.0, limit=100.0, threads=1)  # half of the easy time is over
-    setting = rivals.Setting({"num_steps": 64}, cranes=1, like_mppo=True)
-    rivals.train_cleanrl("", setting, 7, clock)
+    cleanrl(clock)
     said = torch.load("said.pt", weights_only=True)
     words = "--env-id RetryCrane-v0 --seed 7 --no-cuda --num_envs 1 --num_steps 64"
-    assert (said["infos"], said["words"], said["difficulty"]) == ({}, words.split(), 0.5)
+    assert (said["infos"], said["words"]) == ({}, words.split())
+    assert (said["difficulty"], said["retry"], said["mode"]) == (0.5, 0.5, "SAME_STEP")
     assert clock.rows == [[0.33, 3, 0.0, 0.0]]
-    np.testing.assert_allclose(judged[0], said["actions"].detach().clamp(-1, 1), atol=1e-6)
+    assert said["actions"].abs().max() > 1  # the judge limits what the crane would limit
+    np.testing.assert_allclose(judged[0], said["actions"].clamp(-1, 1), atol=1e-5)
+
+
+def test_the_clock_ends_cleanrls_file(monkeypatch, cleanrl):
+    scores = {"success_rate": 0.0, "gentle_rate": 0.0}
+    monkeypatch.setattr(rivals.crane_trials, "evaluate", lambda *_: scores)
+    with pytest.raises(rivals.TimeUp):
+        cleanrl(rivals.Clock(started=800.0, limit=100.0, threads=1))
 
 
 def test_every_setting_has_a_rival():
