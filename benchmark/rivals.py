@@ -14,7 +14,7 @@ the full task, with the normalization of observations that the training has reac
 takes longer, the judge waits for its end. A finished run adds its rows to benchmark/rivals.csv and
 is not run again. A killed run leaves no rows.
 
-Each rival has two settings. `published` is what its makers publish for continuous control:
+Each rival has two settings. `published` was made for other tasks:
 
 - SB3 PPO, sbx PPO, SAC, TQC: rl-baselines3-zoo's settings for PyBullet's HalfCheetah. PPO has 16
   environments, SAC and TQC have one. sbx PPO has no gSDE.

@@ -377,7 +377,7 @@ def ratios(results: Results) -> list[Ratio]:
         sb3_recurrent = max(train("SB3 RecurrentPPO"), train("SB3 RecurrentPPO, 64 at once"))
         ideal, hydraulic = (env(scripted_name(kind)) for kind in ("ideal", "hydraulic"))
         for name, value, target in [
-            ("`CraneVectorEnv` / two threads of bare `mj_step`", skip * ours / limit, env_target),
+            ("`CraneVectorEnv` / twice `mj_step` on one thread", skip * ours / limit, env_target),
             ("`CraneVectorEnv` / Sync- or AsyncVectorEnv of `PlainCrane`", ours / rival, None),
             ("`CraneVectorEnv`, hydraulic drives / ideal servos", hydraulic / ideal, 0.8),
             ("PPO / SB3 PPO on `PlainCrane`", ppo / sb3_ppo, ppo_target),
