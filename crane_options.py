@@ -64,7 +64,8 @@ def check(values: Mapping[str, Any], *annotated: Any) -> None:
         if isinstance(limits, Range):
             (low, high), whole = limits, get_args(kind)[0] is int
             types = (int, np.integer) if whole else (int, float, np.number)
-            good = all(isinstance(item, types) and low <= item <= high for item in items)
+            numbers = all(isinstance(i, types) and not isinstance(i, bool) for i in items)
+            good = numbers and all(low <= item <= high for item in items)
             needed = f"a {'whole ' if whole else ''}number in [{low:,}, {high:,}]"
         elif get_origin(kind) is Literal or kind is bool:
             allowed = get_args(kind) or (False, True)

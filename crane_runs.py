@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 import crane_env
 import crane_trials
-from crane_options import DEFAULTS
+from crane_options import DEFAULTS, OptionError
 
 MAX_BATCH = 2**20  # decisions of a rollout, all in memory
 # What --resume may change. load_checkpoint compares the options in env one by one.
@@ -99,7 +99,8 @@ def read_arguments(algorithm: str, arguments: type, description: str) -> tuple[A
         raise SystemExit(f"--num-envs times --num-steps must be at most {MAX_BATCH:,}")
     if checkpoint and checkpoint["iteration"] > max(1, args.total_timesteps // batch_size):
         done = checkpoint["iteration"] * batch_size
-        raise SystemExit(f"--resume: {done:,} decisions are done; raise --total-timesteps above it")
+        mend = f"give --total-timesteps {done + batch_size} or more"
+        raise SystemExit(f"--resume: {done:,} decisions are done; {mend}")
     return args, checkpoint
 
 
@@ -141,6 +142,8 @@ def load_checkpoint(folder: Path, algorithm: str, arguments: type) -> tuple[Any,
         options = {name: task[name] for name in DEFAULTS if name in task}
         options = checkpoint["args"]["env"] | options
         saved = arguments(**checkpoint["args"] | {"env": options})
+    except OptionError as error:  # a range has changed since
+        raise SystemExit(f"--resume: {path}: {error}") from None
     except Exception:  # a damaged file raises many kinds
         raise SystemExit(f"--resume: {path} is damaged or not of this script") from None
     args = tyro.cli(arguments, default=saved)
@@ -197,8 +200,12 @@ class Run:
         self.env_seed = int(seeds.generate_state(1)[0])
         self.final_scores: dict[str, float] = {}
         if checkpoint is not None:
-            agent.load_state_dict(checkpoint["weights"])
-            optimizer.load_state_dict(checkpoint["optimizer"])
+            try:
+                agent.load_state_dict(checkpoint["weights"])
+                optimizer.load_state_dict(checkpoint["optimizer"])
+            except (RuntimeError, ValueError) as error:
+                reason = str(error).splitlines()[-1].strip()
+                raise SystemExit(f"--resume: the run has another Agent or task: {reason}") from None
             actions = fingerprint(agent, self.spaces["obs_dim"])
             if not torch.allclose(actions, checkpoint["fingerprint"], atol=1e-3):
                 wrote = f"that of {checkpoint['script']}, which began the run"

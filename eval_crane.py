@@ -444,11 +444,13 @@ def report(
     papers_task = env_id.split(":")[-1] in ("ForestryCrane-v0", "ForestryCranePaper-v0")
     papers_task &= not changed
     contact, all_records, tables = given["contact"], [], {}
+    difference = "".join(f", {option}={value!r}" for option, value in changed.items())
+    task = env_id + difference + (", sdf contact" if contact == "sdf" else "")
     noises = [args.pose_noise or "none"] if args.pose_noise or args.json else ["none", "step"]
     for noise in noises:
         torch.manual_seed(args.seed)
         options["pose_noise"] = noise
-        tables[source, env_id, noise] = records = []
+        tables[source, task, noise] = records = []
         try:
             for record in judge(policy, env_id, options, args):
                 records.append(record)
@@ -461,8 +463,7 @@ def report(
             where = {"policy": source, "env_id": env_id, "contact": contact, "pose_noise": noise}
             print_json(records, cells, where | {"seed": args.seed, "changed": changed})
             continue
-        what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}"
-        what += "".join(f", {option}={value!r}" for option, value in changed.items())
+        what = f"{name} ({source}) on {env_id}, {contact} contact, pose noise {noise}{difference}"
         paper = PAPER.get(noise, {}) if papers_task else {}
         title = TITLES[noise] if papers_task else "Trials"
         print_table(records, cells, paper, f"{title}: {what}, seed {args.seed}")

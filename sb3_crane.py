@@ -42,8 +42,9 @@ class CraneVecEnv(VecEnv):
         super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> np.ndarray:
-        seeds = None if None in self._seeds else self._seeds  # `seed` has given them, once
-        obs, _ = self.envs.reset(seed=seeds)
+        # SB3 gives crane i the seed s + i, which crane i - 1 of the next run has, too. From s alone
+        # the cranes draw seeds that no other run has.
+        obs, _ = self.envs.reset(seed=self._seeds[0])
         self._reset_seeds()
         return obs
 

@@ -23,8 +23,9 @@ Each rival has two settings. `published` was made for other tasks:
 - CleanRL PPO: the defaults of its file, with one environment.
 
 `ours` is one try of ours, chosen before any result. It has the cranes and the reward scale of
-mppo_beta_crane.py: starts get harder in the first 0.4 of the time, and some repeat a failure.
-CleanRL's file scales the reward itself, and its learning rate falls over a million decisions.
+mppo_beta_crane.py. Starts get harder in the first 0.4 of the time, and some repeat a failure. But
+the first episode of each crane has the full task. CleanRL's file scales the reward itself, and its
+learning rate falls over a million decisions.
 
 mppo_beta_crane.py runs with its defaults, and its time includes its start. Its schedules end after
 1,024,000 decisions, in 8 to 20 minutes on two cores. A run that needs longer is cut off. It saves a
@@ -181,12 +182,19 @@ class Clock:
 
 
 class TimedCranes(gymnasium.vector.VectorWrapper):
-    """Cranes that look at the clock before each decision, whatever library makes it."""
+    """Cranes that look at the clock before each decision, whatever library makes it.
 
-    def __init__(self, setting: Setting, clock: Clock):
-        self.clock, self.like_mppo = clock, setting.like_mppo
+    seed: of the first reset, if the library gives none.
+    """
+
+    def __init__(self, setting: Setting, clock: Clock, seed: int | None = None):
+        self.clock, self.like_mppo, self.seed = clock, setting.like_mppo, seed
         options = {"env_threads": clock.threads, "retry": 0.5 if self.like_mppo else 0.0}
         super().__init__(gymnasium.make_vec(TASK, setting.cranes, **options))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+        given, self.seed = self.seed if seed is None else seed, None
+        return self.env.reset(seed=given, options=options)
 
     def step(self, actions: np.ndarray) -> tuple:
         self.clock.tick()
@@ -261,7 +269,7 @@ def train_skrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
     from skrl.utils.runner.torch import Runner
 
     skrl.config.torch.device, skrl.config.torch.key = "cpu", seed
-    envs = wrap_env(TimedCranes(setting, clock), wrapper="gymnasium", verbose=False)
+    envs = wrap_env(TimedCranes(setting, clock, seed), wrapper="gymnasium", verbose=False)
     options = deepcopy(setting.options)
     log_std = float(np.log(options.pop("std")))
     net = [{"name": "net", "input": "OBSERVATIONS", **options.pop("net")}]
@@ -417,7 +425,7 @@ class Args:
     threads: Annotated[int, Range(1, 256)] = 2
     """cores of a run, and threads of the physics and of torch"""
     results: Path = RESULTS
-    """CSV file that gets the rows of finished runs"""
+    """CSV file that gets the rows of finished runs; another one for another number of threads"""
     table: bool = False
     """only print the table of the runs of --minutes in this file"""
 
@@ -478,9 +486,10 @@ def results_table(path: Path, budget: float) -> str:
     The best comes first.
     """
     runs = defaultdict(lambda: defaultdict(list))
+    delay = EVERY / 120  # of a judgement, by an update, in minutes
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
-            if float(row["budget"]) == budget:
+            if float(row["budget"]) == budget and float(row["minutes"]) <= budget + delay:
                 runs[row["rival"], row["setting"]][row["seed"]].append(row)
     times = [budget * fifth / 5 for fifth in range(1, 6)]
     head = ["method", "settings", "seeds", "decisions", *(f"{t:.3g} min" for t in times)]
@@ -492,8 +501,9 @@ def results_table(path: Path, budget: float) -> str:
         cells, last = [rival, setting, str(len(seeds))], [rows[-1] for rows in seeds.values()]
         cells.append(f"{np.mean([int(row['decisions']) for row in last]):,.0f}")
         for t in times:
-            late = t + EVERY / 120  # an update may delay a judgement
-            past = [[r for r in rows if float(r["minutes"]) <= late] for rows in seeds.values()]
+            past = [
+                [r for r in rows if float(r["minutes"]) <= t + delay] for rows in seeds.values()
+            ]
             scores = [float(rows[-1]["success"]) if rows else 0.0 for rows in past]
             cells.append(f"{np.mean(scores):.1f}")
         gentle = np.mean([float(row["gentle"]) for row in last])

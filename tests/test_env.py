@@ -531,6 +531,7 @@ def test_action_is_a_fraction_of_the_speed_limit():
         ({"num_envs": 0}, "num_envs"),
         ({"frame_skip": 0}, "frame_skip"),
         ({"frame_skip": 2.5}, "frame_skip"),
+        ({"frame_skip": True}, "frame_skip must be a whole number"),
         ({"frame_skip": "20"}, r"frame_skip must be a whole number in \[1, 1,800\], got '20'"),
         ({"contact": "soft"}, "contact must be one of 'primitive', 'sdf'"),
         ({"reward": "dense"}, "reward"),

@@ -155,6 +155,8 @@ def test_the_papers_figures_stand_beside_the_papers_task_only(run_here, tmp_path
     short = ["--trials", "1", "--pose-noise", "none", "--diameters", "0.5"]
     table = run_here(str(tmp_path / "policy.pt"), *short).out
     assert "Trials: ppo" in table and "Table I" not in table and "| 98 " not in table
+    both = run_here(str(tmp_path / "policy.pt"), str(SHIPPED), *short).out
+    assert "mean of" not in both and f"| {CRANE}, actuators='hydraulic', sensors=True |" in both
     table = run_here(*short, "--env-id", f"crane_env:{CRANE}").out
     assert "Table I, clean" in table and "| 98 " in table
 

@@ -305,7 +305,7 @@ def test_resume_cannot_shorten_a_run(finished, run_here):
     algorithm, run_dir = finished
     before = {file: file.read_bytes() for file in run_dir.iterdir()}
     with pytest.raises(
-        SystemExit, match="--resume: 128 decisions are done; raise --total-timesteps above it"
+        SystemExit, match="--resume: 128 decisions are done; give --total-timesteps 192 or more"
     ):
         run_here(algorithm, "--resume", run_dir, "--total-timesteps", "64")
     assert {file: file.read_bytes() for file in run_dir.iterdir()} == before

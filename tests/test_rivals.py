@@ -58,6 +58,9 @@ def test_the_cranes_of_our_settings_get_harder_with_the_time(now):
     plain = rivals.TimedCranes(rivals.Setting({}, cranes=2), clock)
     (first, _), (second, _) = easy.reset(seed=1), plain.reset(seed=1)
     np.testing.assert_array_equal(first, second)
+    seeded = rivals.TimedCranes(rivals.Setting({}, cranes=2), clock, seed=1)  # for skrl, gives none
+    np.testing.assert_array_equal(seeded.reset()[0], second)
+    assert (seeded.reset()[0] != second).any()
     now[0] += 20  # half of the easy time
     actions = np.zeros((2, 6))
     scaled, full = easy.step(actions)[1], plain.step(actions)[1]

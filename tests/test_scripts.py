@@ -536,6 +536,16 @@ def test_a_changed_network_does_not_resume(tmp_path, run_here, monkeypatch, algo
         run_here(algorithm, "--resume", only_run(tmp_path), "--total-timesteps", "256")
 
 
+def test_a_network_of_another_shape_does_not_resume(tmp_path, run_here):
+    run_here("ppo", *small("ppo"), "--total-timesteps", "128")
+    path = only_run(tmp_path) / "checkpoint.pt"
+    checkpoint = torch.load(path, weights_only=True)
+    checkpoint["weights"]["critic.0.bias"] = torch.zeros(5)
+    torch.save(checkpoint, path)
+    with pytest.raises(SystemExit, match="--resume: the run has another Agent or task: size mism"):
+        run_here("ppo", "--resume", path.parent, "--total-timesteps", "256")
+
+
 ONE_DECISION = {
     "mppo_beta": ("--num-envs 1 --num-steps 1025", "no standard deviation"),
     "ppo": ("--num-envs 3 --num-steps 3 --minibatch-size 4", "no standard deviation"),
