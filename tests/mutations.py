@@ -213,8 +213,8 @@ MUTATIONS = [
     Mutation(
         "a number's range is not checked",
         ("crane_options.py",),
-        "isinstance(item, types) and low <= item <= high for item in items",
-        "isinstance(item, types) for item in items",
+        "good = numbers and all(low <= item <= high for item in items)",
+        "good = numbers",
         "test_failures -k range",
     ),
     Mutation(
