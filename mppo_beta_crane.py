@@ -58,14 +58,14 @@ class Args:
     # experiment
     exp_name: str = Path(__file__).stem  # part of the run's folder name
     seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
-    total_timesteps: Count = 1_024_000  # decisions to train for, over all cranes; whole rollouts
+    total_timesteps: Count = 1_024_000  # decisions of all cranes together, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     torch_threads: Annotated[int, Range(1, 256)] = 2  # CPU threads of an update
     env_threads: Threads = 2  # CPU threads of the physics, 0 for all cores
     resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 
     # task
-    env_id: str = "ForestryCrane-v0"  # a Gymnasium task with flat Box spaces, whose episodes end
+    env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Size = 64  # cranes simulated side by side
     env: crane_options.Options = field(default_factory=lambda: {"retry": 0.5})
     """options of the crane: those of the task, except retry; (task: x): that of ForestryCrane-v0"""

@@ -42,8 +42,8 @@ class CraneVecEnv(VecEnv):
         super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> np.ndarray:
-        # SB3 gives crane i the seed s + i, which crane i - 1 of the next run has, too. From s alone
-        # the cranes draw seeds that no other run has.
+        # SB3 gives crane i the seed s + i, so the cranes of seeds 1 and 2 would share most starts.
+        # From the first seed alone each crane draws random numbers of its own.
         obs, _ = self.envs.reset(seed=self._seeds[0])
         self._reset_seeds()
         return obs

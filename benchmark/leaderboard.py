@@ -124,10 +124,8 @@ def main() -> None:
     rows = read_rows(args.board)
     if args.what == "check" and not rows:
         raise SystemExit(f"{args.board} has no rows")
-    if rows and (missing := {*COLUMNS, *SCORES} - rows[0].keys()):
-        raise SystemExit(f"{args.board} is no leaderboard: it has no {', '.join(sorted(missing))}")
-    if rows and (more := rows[0].keys() - {*COLUMNS, *SCORES}):
-        raise SystemExit(f"{args.board} has columns that a leaderboard lacks: {sorted(more)}")
+    if rows and (wrong := rows[0].keys() ^ {*COLUMNS, *SCORES}):
+        raise SystemExit(f"{args.board} is no leaderboard: columns {sorted(wrong)} differ")
     if unknown := {row["level"] for row in rows} - LEVELS.keys():
         raise SystemExit(f"{args.board}: no level {', '.join(unknown)}; there are {list(LEVELS)}")
     if not args.board.parent.is_dir():

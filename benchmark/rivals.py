@@ -14,7 +14,7 @@ the full task, with the normalization of observations that the training has reac
 takes longer, the judge waits for its end. A finished run adds its rows to benchmark/rivals.csv and
 is not run again. A killed run leaves no rows.
 
-Each rival has two settings. `published` was made for other tasks:
+Each rival has two settings. The settings `published` were made for other tasks:
 
 - SB3 PPO, sbx PPO, SAC, TQC: rl-baselines3-zoo's settings for PyBullet's HalfCheetah. PPO has 16
   environments, SAC and TQC have one. sbx PPO has no gSDE.
@@ -301,7 +301,7 @@ def train_cleanrl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
     """CleanRL's file is not edited. The vector of environments that it gets looks at the clock.
 
     The file is written for Gymnasium 0.29. Here Gymnasium 1 resets a crane in the step that ends
-    its episode, as 0.29 did. `info` is left empty, because the file reads that of 0.29. A
+    its episode, as 0.29 did. `info` is left empty, because the file expects the one of 0.29. A
     transformed observation keeps its space, which the file does not give.
     """
     make_vector, task = gymnasium.vector.SyncVectorEnv, TASK
@@ -425,7 +425,7 @@ class Args:
     threads: Annotated[int, Range(1, 256)] = 2
     """cores of a run, and threads of the physics and of torch"""
     results: Path = RESULTS
-    """CSV file that gets the rows of finished runs; another one for another number of threads"""
+    """CSV file that gets the rows of finished runs; use another file for other --threads"""
     table: bool = False
     """only print the table of the runs of --minutes in this file"""
 
@@ -486,7 +486,7 @@ def results_table(path: Path, budget: float) -> str:
     The best comes first.
     """
     runs = defaultdict(lambda: defaultdict(list))
-    delay = EVERY / 120  # of a judgement, by an update, in minutes
+    delay = EVERY / 120  # min, how late a judgement may be, because an update took long
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
             if float(row["budget"]) == budget and float(row["minutes"]) <= budget + delay:

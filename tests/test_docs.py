@@ -281,6 +281,17 @@ SCORES = {
 }
 
 
+@pytest.mark.parametrize("odd", ["mood", "method"])
+def test_leaderboard_wants_its_columns(tmp_path, monkeypatch, odd):
+    """One too many, and one that is missing."""
+    board = tmp_path / "board.csv"
+    columns = ",".join({*leaderboard.COLUMNS, *leaderboard.SCORES} ^ {odd})
+    board.write_text(f"{columns}\n{columns}\n")
+    monkeypatch.setattr(sys, "argv", ["leaderboard.py", "check", "--board", str(board)])
+    with pytest.raises(SystemExit, match=rf"is no leaderboard: columns \['{odd}'\] differ"):
+        leaderboard.main()
+
+
 def test_leaderboard_shows_means_over_training_seeds(monkeypatch):
     row = {"level": "hydraulic", "method": "two", "training_seed": "1", "training": "an hour"}
     row["revision"] = str(crane_env.REVISION)

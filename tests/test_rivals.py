@@ -159,6 +159,7 @@ def test_the_table_takes_the_last_judgement_before_each_time(tmp_path):
         "a,ours,1,10.0,4.0,900,50,10",
         "a,ours,1,10.0,10.1,3000,90,30",
         "a,ours,2,10.0,10.0,1000,70,50",
+        "a,ours,2,10.0,10.9,9999,99,99",  # too late
         "a,ours,3,0.7,0.7,9,99,99",  # a try: not of these minutes
     ]
     path.write_text("\n".join([",".join(rivals.COLUMNS), *rows]) + "\n")

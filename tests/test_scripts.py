@@ -576,6 +576,7 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         "other": {"algorithm": "other"},
         "task": {"task": task | {"revision": crane_env.REVISION - 1}},
         "more": {"args": {**args, "warp": 9}},
+        "range": {"args": {**args, "gamma": 2.0}},
         "old": {"task": crane_env.REVISION},
     }.items():
         (tmp_path / name).mkdir()
@@ -594,6 +595,7 @@ def test_clear_errors(tmp_path, run_here, capsys, algorithm):
         ("text", "is damaged or not of this script"),
     ]:
         assert error_of("--resume", name) == f"--resume: {name}/checkpoint.pt {reason}"
+    assert error_of("--resume", "range").endswith("gamma must be a number in [0, 1], got 2.0")
     mend = "give the folder of a run"
     for name in ("empty", "nowhere", "text/checkpoint.pt"):
         assert error_of("--resume", name) == f"--resume: there is no {name}/checkpoint.pt; {mend}"
