@@ -1,108 +1,301 @@
-"""A forestry crane that grasps and lifts a log: MuJoCo simulator and Gymnasium environment.
+"""A forestry crane that grasps and lifts a log: the MuJoCo simulator and Gymnasium environment.
 
-    import gymnasium, crane_env
-    env = gymnasium.make("ForestryCrane-v0")                    # one crane, `CraneEnv`
-    envs = gymnasium.make_vec("ForestryCrane-v0", num_envs=64)  # many at once, `CraneVectorEnv`
+    import gymnasium
+    env = gymnasium.make("crane_env:ForestryCrane-v0")                    # one crane: CraneEnv
+    envs = gymnasium.make_vec("crane_env:ForestryCrane-v0", num_envs=64)  # many: CraneVectorEnv
 
-The crane turns at q1 (slew), lifts at q2 (boom) and q3 (arm), reaches with q4 (two equal telescope
-stages). Two passive joints q5, q6 let a rotator q7 hang down with the grapple's two jaws q8.
-Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log Grasping with a Forestry
-Crane: Simulator and Benchmarking". `ForestryCranePaper-v0` comes close to the task as printed.
-`ForestryCraneHydraulic-v0` has drives as measured on the machine. In `ForestryCraneRandomized-v0`
-each episode draws drives, a log and sensor errors.
-Sources of all numbers: assets/README.md. The task on one page: docs/environment.md.
+The crane slews at q1, lifts at q2 (boom) and q3 (arm) and reaches with q4 (two equal telescope
+stages). Two passive joints q5 and q6 let the grapple hang: a rotator q7 with two jaws q8. A log
+lies somewhere in front of the crane. Within 6 s the grapple must reach it. At the end of the 9 s it
+must hang in the jaws. Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log
+Grasping with a Forestry Crane: Simulator and Benchmarking". assets/README.md has the source of
+every number, docs/environment.md the task on one page.
 
-Observation, float32, `Box` of shape (18,), with sensors (32,):
+Observation, float32, `Box` of shape (18,):
 
-| index | meaning                                          | unit  | low     | high   |
-|-------|--------------------------------------------------|-------|---------|--------|
-| 0     | q1 slew angle                                    | rad   | -4.21   | 4.21   |
-| 1     | q2 boom angle, positive lifts                    | rad   | -1.7    | 2.063  |
-| 2     | q3 arm angle, 0 square to the boom               | rad   | -1.41   | 2.0    |
-| 3     | q4 length of each telescope stage                | m     | -0.5    | 2.736  |
-| 4     | q5 passive tip angle, hangs at pi/2 - q2 - q3    | rad   | -2.0708 | 2.0708 |
-| 5     | q6 passive tilt angle, hangs at pi/2             | rad   | 0.2854  | 2.8562 |
-| 6     | q7 rotator angle                                 | rad   | -3.6416 | 3.6416 |
-| 7     | q8 jaw angle, 0 open                             | rad   | -0.5    | 3.5    |
-| 8     | q1 velocity                                      | rad/s | -10     | 10     |
-| 9     | q2 velocity                                      | rad/s | -10     | 10     |
-| 10    | q3 velocity                                      | rad/s | -10     | 10     |
-| 11    | q4 velocity of each stage                        | m/s   | -10     | 10     |
-| 12    | q7 velocity                                      | rad/s | -10     | 10     |
-| 13    | q8 velocity                                      | rad/s | -10     | 10     |
-| 14    | Delta_p,x, grapple centre to log (option axes)   | m     | -20     | 20     |
-| 15    | Delta_p,y                                        | m     | -20     | 20     |
-| 16    | Delta_p,z (option offset)                        | m     | -20     | 20     |
-| 17    | signed angle to the log, 0 aligned, see below    | rad   | -4.7124 | 4.7124 |
-| 18    | last command of q1, fraction of its limit        | 1     | -1      | 1      |
-| 19    | last command of q2                               | 1     | -1      | 1      |
-| 20    | last command of q3                               | 1     | -1      | 1      |
-| 21    | last command of q4                               | 1     | -1      | 1      |
-| 22    | last command of q7                               | 1     | -1      | 1      |
-| 23    | last command of q8                               | 1     | -1      | 1      |
-| 24    | q5 velocity                                      | rad/s | -10     | 10     |
-| 25    | q6 velocity                                      | rad/s | -10     | 10     |
-| 26    | force of the oil on q1, fraction of its limit    | 1     | -1      | 1      |
-| 27    | force of the oil on q2                           | 1     | -1      | 1      |
-| 28    | force of the oil on q3                           | 1     | -1      | 1      |
-| 29    | force of the oil on q4                           | 1     | -1      | 1      |
-| 30    | force of the oil on q7                           | 1     | -1      | 1      |
-| 31    | force of the oil on q8                           | 1     | -1      | 1      |
+| index  | meaning                                                | unit       | low, high      |
+|--------|--------------------------------------------------------|------------|----------------|
+| 0      | q1 slew                                                | rad        | -4.21, 4.21    |
+| 1      | q2 boom, positive lifts                                | rad        | -1.7, 2.063    |
+| 2      | q3 arm, 0 is square to the boom                        | rad        | -1.41, 2.0     |
+| 3      | q4 length of each telescope stage                      | m          | -0.5, 2.736    |
+| 4      | q5 passive, hangs at pi/2 - q2 - q3                    | rad        | -2.071, 2.071  |
+| 5      | q6 passive, hangs at pi/2                              | rad        | 0.285, 2.856   |
+| 6      | q7 rotator                                             | rad        | -3.642, 3.642  |
+| 7      | q8 jaws, 0 is open                                     | rad        | -0.5, 3.5      |
+| 8-13   | velocities of q1, q2, q3, q4, q7, q8                   | rad/s, m/s | -10, 10        |
+| 14-16  | Delta_p, grapple centre to log: ahead, left, up        | m          | -20, 20        |
+| 17     | signed angle from the grapple to the log, 0 is aligned | rad        | -4.712, 4.712  |
 
-Indices 18 to 31 exist with sensors=True only, as in `ForestryCraneHydraulic-v0`. With
-signed_yaw=False index 17 is the paper's Delta_psi, without unit.
+Action, float32, `Box` of shape (6,): each joint's commanded velocity as a fraction of its limit in
+that direction. 0 stops the joint. Values outside the box are clipped.
 
-Action, float32, `Box` of shape (6,): commanded joint velocity as a fraction of its limit in that
-direction. 0 stops the joint; values outside the box are clipped.
+| index | joint                  | low, high | speed at -1 and +1    |
+|-------|------------------------|-----------|-----------------------|
+| 0     | q1 slew                | -1, 1     | -0.764, 0.802 rad/s   |
+| 1     | q2 boom                | -1, 1     | -0.326, 0.239 rad/s   |
+| 2     | q3 arm                 | -1, 1     | -0.344, 0.326 rad/s   |
+| 3     | q4 each stage          | -1, 1     | -0.630, 0.400 m/s     |
+| 4     | q7 rotator             | -1, 1     | -2.12, 2.12 rad/s     |
+| 5     | q8 jaws, + closes      | -1, 1     | -1.8, 1.8 rad/s       |
 
-| index | meaning          | unit | low | high | speed "real" at -1, +1    | speed "mjcf"  |
-|-------|------------------|------|-----|------|---------------------------|---------------|
-| 0     | q1 slew          | 1    | -1  | 1    | -0.764, 0.802 rad/s       | -1.57, 1.57   |
-| 1     | q2 boom          | 1    | -1  | 1    | -0.326, 0.239 rad/s       | -1.57, 1.57   |
-| 2     | q3 arm           | 1    | -1  | 1    | -0.344, 0.326 rad/s       | -1.57, 1.57   |
-| 3     | q4 each stage    | 1    | -1  | 1    | -0.630, 0.400 m/s         | -2, 2         |
-| 4     | q7 rotator       | 1    | -1  | 1    | -2.12, 2.12 rad/s         | -3, 3         |
-| 5     | q8 jaws          | 1    | -1  | 1    | -1.8, 1.8 rad/s           | -3, 3         |
+A task of your own is a subclass of `CraneVectorEnv` that overrides some of its hooks. They stand in
+the order in which a step calls them. hydraulic_crane.py is such a task, docs/tutorial.md shows
+smaller ones.
 """
 
-import ctypes
-import ctypes.util
 import os
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Annotated, Any, Literal, Unpack
-from weakref import WeakSet
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
 
-if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
+if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
     os.environ.setdefault("MUJOCO_GL", "egl")  # mujoco chooses its OpenGL when it is imported
 
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch, SimulationError
+from numpy import ndarray as Array
 from numpy.random import Generator, SeedSequence, default_rng
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-import crane_options
-import crane_task
-import machine
-from crane_options import Options, Range, Size, Threads, check, complete
-from crane_task import CONDITIONS, D_MAX, D_MIN, GENTLE_FORCE, LOG_LENGTH, TERMS, CraneState
-from machine import ACTUATED, COMMAND_OF_SERVO, COSTS, JOINTS, PASSIVE, SERVOS, SPEEDS, TIMESTEP
+# ---- the machine
 
-# ---- constants
+MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
+SPEED_LIMITS = np.array(  # lowest and highest of q1, q2, q3, q4, q7, q8: rad/s, per stage m/s
+    [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
+)
+JAW_LENGTH = 0.8566  # m, from a jaw's pivot to its tip
+PIVOT_HEIGHT = 0.5  # m, from p_C up to the pivots
+Q8_MAX = 3.0  # rad
+ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
+# The engine's joints, before the seven numbers of the log's pose, and our lists of them:
+#
+#             index:  0   1   2   3   4          5   6   7   8   9
+#             joint:  q1  q2  q3  q4  q4_stage2  q5  q6  q7  q8  q8_inner
+JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]  # our q1 ... q8
+SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the eight that have a servo
+ACTION_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]  # which of the six actions moves each servo
+ACTUATED = [0, 1, 2, 3, 6, 7]  # the six of our q1 ... q8 that an action moves
 
-HEADLESS = sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
-REVISION = 7  # of the task; raise it when a change makes trained policies worse
-ANTI_WINDUP = 5  # most steps between two clamps of the integrators; crane.xml's nsample equals it
+# ---- the task
 
-CARE = ["gentle", *COSTS, "time_up", "log_speed"]
-Array = np.ndarray
-ALIVE: WeakSet["CraneVectorEnv"] = WeakSet()  # all cranes, for `outlive_fork`
+LOG_LENGTH = 2.75  # m (paper)
+LOG_DENSITY = 650.0  # kg/m^3, the low end of green spruce; the paper does not give it
+D_MIN, D_MAX = 0.3, 0.8  # m, log diameter (paper)
+REACH_DISTANCE = 0.35  # m, epsilon of d_combine; with less, good grips off the centre do not count
+LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre (paper)
+LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.005 rad or 0.012 m
+MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
+MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
+GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.5 kN
+POSE_RANGE = 8.0  # m, d_max of the pose noise's decay s(Delta_p)
+POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o (paper, Sec. V-D)
+
+# ---- the reward
+
+OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
+DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give it
+GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed the jaws
+LIFT_WEIGHT = 2.0  # largest part of staged r_lift that height earns; CARRY_WEIGHT adds to it
+BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
+CLOSING_HEIGHT = 0.1  # m above Delta_p = 0: closing jaws pull the grapple down, onto the ground
+NEAR_SHARPNESS = 3.0  # 1/m, how fast r_grapple falls beyond REACH_DISTANCE
+GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
+LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
+CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
+
+STRICT = {"strict": True, "allow_inf_nan": False}  # of pydantic: no "3" for 3, no 1 for True
+
+
+@dataclass(config=STRICT)
+class Options:
+    """What can be changed about the task: keywords of `gymnasium.make`, `--env.*` of the scripts.
+
+    pydantic's ValidationError, a ValueError, names a wrong value and what is allowed.
+    """
+
+    frame_skip: Annotated[int, Field(ge=1, le=1200)] = 20  # physics steps per step; the paper: 1
+    contact: Literal["primitive", "sdf"] = "primitive"  # sdf: jaw meshes, the paper's solver
+    reward: Literal["staged", "paper"] = "staged"  # staged, or Sec. IV-B2 as printed
+    offset: Literal["plus", "minus"] = "plus"  # sign of the diameter's part in Delta_p,z
+    signed_yaw: bool = True  # observe the signed angle to the log, not the paper's Delta_psi
+    axes: Literal["crane", "world"] = "crane"  # of Delta_p; crane: ahead, left, up
+    pose_noise: Literal["none", "step", "episode"] = "none"  # how often the pose error is drawn
+
+
+# ---- starts
+
+
+def tip_position(q2: Array, q3: Array, q4: Array) -> tuple[Array, Array]:
+    """Distance of the tip joint from the slew axis and its height, both in m (DH parameters)."""
+    arm = 3.157 + 2 * q4
+    out = -0.18 + 3.49288 * np.cos(q2) - 0.3925 * np.cos(q2 + q3) + arm * np.sin(q2 + q3)
+    up = 3.5657 + 3.49288 * np.sin(q2) - 0.3925 * np.sin(q2 + q3) - arm * np.cos(q2 + q3)
+    return out, up
+
+
+def sample_start(rng: Generator) -> tuple[Array, Array, float]:
+    """Draw one start of the full task: q (8,), log pose (x, y, yaw) in m and rad, diameter in m."""
+    good = np.zeros(1, bool)
+    while not good.any():
+        q2, q3, q4 = rng.uniform([0.1, -0.6, 0.05], [1.0, 0.8, 1.0], size=(32, 3)).T
+        out, up = tip_position(q2, q3, q4)
+        good = (4.5 <= out) & (out <= 8) & (2.7 <= up) & (up <= 4.2) & (q2 + q3 > 0.05)
+    q2, q3, q4 = np.stack([q2, q3, q4])[:, np.argmax(good)]
+    q1, azimuth = rng.uniform(-2 * np.pi / 3, -np.pi / 3, size=2)
+    swing5, swing6 = rng.uniform(-0.05, 0.05, size=2)
+    q7, yaw = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
+    q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
+    q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
+    return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
+
+
+def ease_start(
+    q: Array, log_pose: Array, diameter: float, difficulty: float
+) -> tuple[Array, Array, float]:
+    """A start of `sample_start` with its log moved towards an easy place, which difficulty 0 has.
+
+    The easy place is under the boom's tip, or as near to it as logs may lie. It has the grapple's
+    yaw and the mean diameter.
+    """
+    q1, q7, (x, y, yaw) = q[0], q[6], log_pose
+    out, _ = tip_position(*q[1:4])
+    easiest = np.array([np.clip(out, 5.5, 7.5), q1, q1 - q7, (D_MIN + D_MAX) / 2])
+    way = np.array([np.hypot(x, y), np.arctan2(y, x), yaw, diameter]) - easiest
+    way[2] = (way[2] + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
+    radius, azimuth, yaw, diameter = easiest + difficulty * way
+    yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
+    return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
+
+
+# ---- geometry
+
+
+class CraneState(NamedTuple):
+    """What observation, reward and rules are computed from, for N cranes."""
+
+    q: Array  # (N, 8) joint positions, rad and m
+    dq: Array  # (N, 6) velocities of the actuated joints
+    grapple_centre: Array  # (N, 3) p_C, m
+    grapple_axis: Array  # (N, 3) e_C,x, unit
+    log_centre: Array  # (N, 3) p_l, m
+    log_axis: Array  # (N, 3) along the log, unit
+    touching: Array  # (N, 2) bool, outer and inner jaw on the log
+    diameter: Array  # (N,) m
+    # (N,) 1 - (force of log and crane on the ground) / (weight of the log), clipped to [0, 1]
+    carried: Array | float = 0.0
+
+
+def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
+    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
+
+    Paper: Eqs. (relative distance) and (angle distance). offset "plus" adds d_off = (d_max - d) / 2
+    of the log's diameter d, "minus" subtracts it. The signed angle turns the grapple's axis into
+    the log's. A log looks the same after half a turn, so this is the shorter turn, or the longer
+    one where the shorter would take the rotator beyond ROTATOR_MAX.
+    """
+    delta_p = state.log_centre - state.grapple_centre
+    delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
+    (grapple_x, grapple_y, _), (log_x, log_y, _) = state.grapple_axis.T, state.log_axis.T
+    shadow = np.maximum(np.sqrt(log_x**2 + log_y**2), 1e-9)  # its length on the ground
+    log_x, log_y = log_x / shadow, log_y / shadow
+    dot = grapple_x * log_x + grapple_y * log_y
+    cross = grapple_x * log_y - grapple_y * log_x
+    signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
+    slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
+    slew = (slew + np.pi) % (2 * np.pi) - np.pi
+    # q7 once the crane faces the log and the grapple is aligned; a hanging grapple's yaw is q1 - q7
+    rotator = state.q[:, 6] + slew - signed_angle
+    signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > ROTATOR_MAX)
+    return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
+
+
+def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
+    """Pose measurement errors of Sec. V-D; epsilon (N, 2) holds epsilon_p and epsilon_o."""
+    decay = np.sum(delta_p**2, axis=-1, keepdims=True) / POSE_RANGE**2  # s(Delta_p)
+    factor = 1 + epsilon * decay
+    return delta_p * factor[:, :1], angle * factor[:, 1]
+
+
+def log_clearance(state: CraneState) -> Array:
+    """Height of the lowest point of the log above the ground, (N,) in m."""
+    up = np.minimum(np.abs(state.log_axis[:, 2]), 1.0)
+    below_centre = LOG_LENGTH / 2 * up + state.diameter / 2 * np.sqrt(1 - up**2)
+    return state.log_centre[:, 2] - below_centre
+
+
+def centre_miss(state: CraneState) -> Array:
+    """Distance from the log's centre to p_C, measured along the log, (N,) in m."""
+    return np.abs(np.sum((state.grapple_centre - state.log_centre) * state.log_axis, axis=-1))
+
+
+def speed_limit(command: Array) -> Array:
+    """Speed limit, positive, in the direction of each command (N, 6), rad/s and m/s."""
+    return np.where(command < 0, -SPEED_LIMITS[0], SPEED_LIMITS[1])
+
+
+# ---- reward
+
+
+def paper_terms(state: CraneState, d_combine: Array, command: Array) -> dict[str, Array]:
+    """The reward as printed in Sec. IV-B2, (N,) each.
+
+    With open jaws r_distance + r_grapple is 1 at any distance, and a crane at rest earns r_balance:
+    a policy learns to stand still. That is why `staged_terms` is the default.
+    """
+    r_distance = np.exp(-OMEGA2 * d_combine)
+    closed = state.q[:, 7] / Q8_MAX
+    r_grapple = r_distance * closed + (1 - closed) * (1 - r_distance)
+    height_error = np.abs(state.log_centre[:, 2] - DESIRED_HEIGHT)
+    r_lift = (1 - np.tanh(height_error)) * (1 - r_grapple)
+    r_balance = (1 - np.tanh(np.linalg.norm(command, axis=-1))) * (1 - r_lift)
+    return dict(r_distance=r_distance, r_grapple=r_grapple, r_lift=r_lift, r_balance=r_balance)
+
+
+def staged_terms(
+    state: CraneState,
+    distance: Array,
+    clearance: Array,
+    miss: Array,
+    command: Array,
+    closed: Array,
+    grip: Array,
+) -> dict[str, Array]:
+    """Each term pays for one stage, and more than the one before, (N,) each.
+
+    r_grapple pays for jaws that close near the log's centre, r_lift for a log that rises there, and
+    r_balance for a crane that holds still while both jaws hold the lifted log.
+
+    distance (N,) in m is ||Delta_p|| + 1 m Delta_psi, with Delta_p 0 where the grapple is
+    CLOSING_HEIGHT higher. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
+    command (N, 6) the commanded velocities in rad/s and m/s. closed and grip (N,) in [0, 1] say how
+    far the jaws are closed and how well they would lift.
+    """
+    near = np.minimum(1, np.exp(-NEAR_SHARPNESS * (distance - REACH_DISTANCE)))
+    held = state.touching.all(axis=-1)
+    clearance = np.maximum(clearance, 1e-9)  # 0 on the ground
+    height = np.sqrt(np.minimum(clearance, 1 / clearance))  # 1 at 1 m, less below and above
+    calm = 1 - np.tanh(np.linalg.norm(command[:, :5], axis=-1))  # the jaws may squeeze
+    lift, carry = grip * height, CARRY_WEIGHT * centred(miss) * held * state.carried
+    return dict(
+        r_distance=np.exp(-OMEGA2 * distance),
+        r_grapple=GRAPPLE_WEIGHT * near * np.exp(-((miss / GRAPPLE_MISS) ** 2)) * closed,
+        r_lift=LIFT_WEIGHT * lift + carry,
+        r_balance=BALANCE_WEIGHT * calm * held * lift,
+    )
+
+
+def centred(miss: Array) -> Array:
+    """1 for a grip at the log's centre, 1/e for one that is LIFT_MISS off."""
+    return np.exp(-((miss / LIFT_MISS) ** 2))
 
 
 # ---- environments
@@ -115,126 +308,185 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     not depend on N or on the threads.
 
     `info` describes the step just made, for every crane, also one whose episode just ended:
-    `termination` (one of TERMINATIONS, or "none"), the reward's TERMS, `d_combine`, `clearance`,
-    `centre_miss` (m), `diameter` (m), `log_mass` (kg), `time_to_reach` (s, inf before), and, where
-    an episode ended, `success`, the same as `is_success` for Stable-Baselines3, and which of
-    CONDITIONS failed it. The mask `_key` says for which cranes `key` is meaningful. `final_obs` and
-    `final_info` hold the end of an episode.
+    the reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass` (kg),
+    `time_to_reach` (s, inf before), `ground_peak` (N, largest force of the crane on the ground in
+    this episode), `safe` (whether all `conditions` have held for HOLD_TIME) and `termination`: the
+    rule that ended the episode, "time_limit" or "none". Where an episode ended, there are `success`
+    (for Stable-Baselines3 `is_success`), `gentle` (success with at most GENTLE_FORCE on the ground)
+    and `failure`: the rule or the first of `conditions` that failed. The mask `_key` says for which
+    cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an episode, because the
+    observation is that of the next start (SAME_STEP autoreset).
 
-    CARE says what the episode has cost so far: `ground_peak` (N), `ground_impulse` (N s) and
-    `ground_time` (s above GENTLE_FORCE) of the crane's force on the ground, `litres` of oil,
-    `energy` of the pump and `work` of the drives (J), `swing_peak` (rad) of the grapple, `time_up`
-    (s, when the log was safely up; inf before, and if it is lost), `log_speed` (m/s), and `gentle`,
-    success with at most GENTLE_FORCE. With randomize, `drawn_...` say what was drawn.
+    `difficulty` in [0, 1] eases the starts (1 is the full task), `retry` in [0, 1] is the largest
+    share of episodes that repeat a failed start. Both may be set at any time. `observers` are
+    called as observer(envs, seconds) after each piece of a step, which is PIECE physics steps long
+    or less.
     """
 
-    metadata = {
-        "render_modes": ["rgb_array"] if HEADLESS else ["human", "rgb_array"],
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
+    Options = Options
+    REVISION = 7  # of the task; raise it when a change makes trained policies worse
+    TIME_LIMIT = 9.0  # s, of an episode (paper, Tables I and II)
+    REACH_TIME = 6.0  # s, by which the log must have been reached (paper)
+    HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
+    PIECE = 5  # physics steps between two clamps of the integrators (assets/README.md)
+    # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
+    # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
+    GROUND_WEIGHT, GROUND_MOST = 30.0, 1.0
 
     def __init__(
         self,
-        num_envs: Size = 1,  # N
+        num_envs: int = 1,  # N
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
-        env_threads: Threads = 0,  # physics threads, 0 for all cores
+        difficulty: float = 1.0,
+        retry: float = 0.0,
+        env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: Literal["human", "rgb_array"] | None = None,
         camera: Literal["overview", "side", "grapple"] = "overview",
-        width: Annotated[int, Range(1, 1920)] = 640,
-        height: Annotated[int, Range(1, 1080)] = 480,
-        autoreset_mode: Literal["SameStep", "NextStep"] = "SameStep",  # or Gymnasium's enum
-        **options: Unpack[Options],
+        width: int = 640,
+        height: int = 480,
+        decorate: Callable[[mujoco.MjSpec], None] | None = None,  # adds what is only seen
+        autoreset: bool = True,  # False: `CraneEnv` resets
+        **options: Any,  # `Options`
     ):
-        given = {
-            "num_envs": num_envs,
-            "env_threads": env_threads,
-            "render_mode": render_mode,
-            "camera": camera,
-            "width": width,
-            "height": height,
-            "autoreset_mode": getattr(autoreset_mode, "value", autoreset_mode),
-        }
-        check(given | options, CraneVectorEnv.__init__, Options)
-        if render_mode == "human" and HEADLESS:  # the window's library would end the process
-            raise RuntimeError("render_mode 'human' needs a display, and DISPLAY is not set")
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        if diameter is not None:
-            d = np.asarray(diameter)
-            fits = d.shape in [(), (num_envs,)] and d.dtype.kind in "fiu"
-            if not fits or not np.all((D_MIN <= d) & (d <= D_MAX)):
-                needed = f"one number or {num_envs} numbers in [{D_MIN}, {D_MAX}] m"
-                raise ValueError(f"diameter must be {needed}, got {diameter}")
-            diameter = np.broadcast_to(d.astype(float), num_envs)
-        self.options = options = complete(options)
-        self.task = {"revision": REVISION, **options}  # what a trained policy knows of it
-        self.num_envs, self.fixed_diameter = int(num_envs), diameter
-        self.process = os.getpid()
+        self.options = self.Options(**options)
+        self.num_envs, self.difficulty, self.retry = num_envs, difficulty, retry
         self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
-        self.viewer = None  # the window, or the renderer of "rgb_array"
-        self.watch: Callable[[float], None] | None = None  # after each piece, with its seconds
-        self.speed, self.frame_skip = SPEEDS[options["speed"]], int(options["frame_skip"])
-        self.difficulty = options["difficulty"]
-        self.dt = self.frame_skip * TIMESTEP  # s, one decision
-        self.max_decisions = int(np.ceil(crane_task.TIME_LIMIT / self.dt - 1e-9))
-        # The hold begins and ends with a decision, and both count.
-        self.hold_decisions = int(np.floor(crane_task.HOLD_TIME / self.dt + 1e-9)) + 1
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
-        self.metadata["autoreset_mode"] = self.autoreset_mode
+        self.viewer: Any = None
+        self.autoreset, self.observers = autoreset, []
+        if diameter is not None:
+            diameter = np.broadcast_to(np.asarray(diameter, float), num_envs)
+            if not np.all((D_MIN <= diameter) & (diameter <= D_MAX)):
+                raise ValueError(f"diameter must be in [{D_MIN}, {D_MAX}] m, got {diameter}")
+        self.fixed_diameter = diameter
 
-        engine = {name: options[name] for name in ("contact", "integrator", "solver", "actuators")}
-        self.model = machine.load_model(**engine, visual=render_mode is not None)
-        self.hydraulic = options["actuators"] == "hydraulic"
-        self.batch = batch = Batch(self.model, self.num_envs, env_threads, persistent=True)
-        ALIVE.add(self)
+        spec = self.make_spec()
+        if decorate:
+            decorate(spec)
+        spec.compiler.discardvisual = render_mode is None  # the same motion, sooner
+        self.model = model = spec.compile()
+        self.frame_skip = self.options.frame_skip
+        self.dt = self.frame_skip * model.opt.timestep  # s, one step
+        self.max_steps = int(np.ceil(self.TIME_LIMIT / self.dt - 1e-9))
+        # The hold begins and ends with a step, and both count.
+        self.hold_steps = int(np.floor(self.HOLD_TIME / self.dt + 1e-9)) + 1
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
+
+        self.batch = batch = Batch(model, num_envs, env_threads, persistent=True)
         for field in ("geom_size", "body_mass", "body_inertia"):
             batch.expand(field)  # each crane has a log of its own
-        if options["randomize"]:  # and a machine of its own
-            names = ("actuator_gainprm", "actuator_biasprm", "actuator_delay", "dof_damping")
-            self.engine = {name: batch.expand(name) for name in (*names, "geom_friction")}
         # live views of the engine's arrays, one row a crane
         self.qpos, self.qvel, self.act = batch.bind("qpos"), batch.bind("qvel"), batch.bind("act")
         self.ctrl, self.qfrc_bias = batch.bind("ctrl"), batch.bind("qfrc_bias")
-        self.drive_force, self.sensordata = batch.bind("qfrc_actuator"), batch.bind("sensordata")
-        self.log_size, self.log_velocity = batch.geom("log").size, batch.joint("log").qvel
+        self.sensordata = batch.bind("sensordata")
         # history ends with ground_force, the only sensor that has one: x, y, z of the last steps
-        remembered = 3 * self.model.sensor_history[:, 0].max()
-        self.ground_force = batch.bind("history")[:, -remembered:]
-        self.joint_range = self.model.jnt_range[JOINTS]  # (8, 2), rad and m
-        velocity, integrators = np.split(self.model.actuator_gainprm, 2)
-        self.servo_kv = velocity[:, 0]  # 0 of hydraulic drives
-        self.servo_kp = np.tile(integrators[:, 0], (self.num_envs, 1))
-        self.max_lead = self.model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp
-        self.drawn = {
-            name: np.tile(nominal, (self.num_envs, *[1] * np.ndim(nominal)))
-            for name, (nominal, _, _) in machine.DRAWN.items()
-            if self.hydraulic or name not in machine.OF_DRIVES
-        }
-        self.valves = machine.Valves(self.num_envs)
-        self.costs = machine.Costs(self.num_envs)
-        self.time_up = np.full(self.num_envs, np.inf)  # s
-        self.decisions = np.zeros(self.num_envs, int)  # since the start of each episode
-        self.reach_time = np.full(self.num_envs, np.inf)  # s
-        self.streaks = np.zeros((3, self.num_envs), int)  # of `grip_conditions`, in decisions
-        self.resting = np.zeros(self.num_envs, bool)  # NEXT_STEP: ended in the step before
-        self.starts: list[tuple] = [()] * self.num_envs
-        self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
-        draws = self.max_decisions + 1 if options["pose_noise"] == "step" else 1
-        self.noise = np.zeros((self.num_envs, draws, 2))  # epsilon_p, epsilon_o
+        self.ground_force = batch.bind("history")[:, -3 * self.PIECE :]
+        self.joint_range = model.jnt_range[JOINTS]  # (8, 2), rad and m
+        _, integrators = np.split(model.actuator_gainprm, 2)
+        self.servo_kp = np.tile(integrators[:, 0], (num_envs, 1))
+        self.max_lead = model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp  # rad, m
 
-        low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
-        bound = np.repeat([10.0, 20.0, 1.5 * np.pi], [6, 3, 1])  # dq, Delta_p, its angle
-        if options["sensors"]:
-            bound = np.append(bound, np.repeat([1.0, 10.0, 1.0], [6, 2, 6]))
-        bounds = np.float32([[*low, *-bound], [*high, *bound]])
-        self.single_observation_space = gymnasium.spaces.Box(*bounds)
+        self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
+        self.starts: list[tuple] = [()] * num_envs
+        self.density = np.full(num_envs, LOG_DENSITY)  # kg/m^3
+        self.command = np.zeros((num_envs, 6))  # rad/s, m/s
+        self.steps = np.zeros(num_envs, int)  # since the start of each episode
+        self.reach_time = np.full(num_envs, np.inf)  # s
+        self.streaks: dict[str, Array] = {}  # for how many steps each of `conditions` has held
+        self.impact = np.zeros(num_envs)  # N, largest force on the ground in the last step
+        self.ground_peak = np.zeros(num_envs)  # N, in the episode
+        draws = self.max_steps + 1 if self.options.pose_noise == "step" else 1
+        self.noise = np.zeros((num_envs, draws, 2))  # epsilon_p, epsilon_o
+
+        low, high = np.float32(self.observation_limits())
+        self.single_observation_space = gymnasium.spaces.Box(low, high)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """What a trained policy knows of its task."""
+        return {"revision": self.REVISION, "options": asdict(self.options)}
+
+    # ---- one step
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Advance every crane by one step, actions (N, 6), and start anew after an end.
+
+        RuntimeError before `reset`, ValueError for actions of another shape or not finite.
+        """
+        # command
+        actions = np.asarray(actions, dtype=np.float64)
+        if self.rngs is None:
+            raise RuntimeError("call reset() before step()")
+        if actions.shape != (self.num_envs, 6) or not np.isfinite(actions).all():
+            raise ValueError(f"actions must be finite, ({self.num_envs}, 6), got {actions}")
+        actions = np.clip(actions, -1, 1)
+        self.command = actions * speed_limit(actions)
+
+        # simulate
+        diverged = self.simulate()
+        self.steps += 1
+        state, time = self.state(), self.steps * self.dt
+
+        # observe
+        obs = self.observation(state)
+
+        # measure
+        info = self.measure(state) | {"time": time}
+        in_time = time < self.REACH_TIME + 1e-9
+        reached = (info["d_combine"] < REACH_DISTANCE) & in_time
+        self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
+        info["time_to_reach"] = self.reach_time.copy()
+        terms = self.reward_terms(state, info)
+        terms = {name: np.where(np.isnan(term), 0.0, term) for name, term in terms.items()}
+        info |= terms
+        reward = np.where(diverged, 0.0, sum(terms.values()))
+
+        # rules
+        rules = self.rules(state, diverged)
+        late = time > self.TIME_LIMIT - 1e-9
+        ending = np.select([*rules.values(), late], [*rules, "time_limit"], default="none")
+        truncated = ending == "time_limit"
+        terminated = (ending != "none") & ~truncated
+        done = terminated | truncated
+
+        # success: each condition held at every step of the last HOLD_TIME, no rule ended it early
+        holds = self.conditions(state, info)
+        self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
+        held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
+        info["safe"] = np.all([*held.values()], axis=0)
+        success = truncated & info["safe"]
+        gentle = success & (self.ground_peak <= GENTLE_FORCE)
+        failure = np.select([~ok for ok in held.values()], [*held], default="")
+        failure = np.where(terminated, ending, failure)
+        failure[~done | success] = ""
+        info["termination"] = ending
+        info |= {"success": success, "is_success": success, "gentle": gentle, "failure": failure}
+        for i in np.flatnonzero(done):
+            self.recent_success[i].append(bool(success[i]))
+            if not success[i]:
+                self.failures[i].append(self.starts[i])
+
+        # autoreset
+        of_ends = ("success", "is_success", "gentle", "failure")
+        everywhere = np.ones(self.num_envs, bool)
+        info |= {f"_{key}": done if key in of_ends else everywhere for key in info}
+        if self.autoreset and done.any():
+            info["final_info"] = info.copy()
+            info["final_obs"] = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(done):
+                info["final_obs"][i] = obs[i].copy()
+            info["_final_obs"] = info["_final_info"] = done
+            self.start_episodes(np.flatnonzero(done))
+            obs[done] = self.observation(self.state())[done]
+        if self.render_mode == "human":
+            self.render()
+        return obs, reward, terminated, truncated, info
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
-        if options:
-            raise ValueError(f"reset takes no options, got {options}; see difficulty and diameter")
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self.rngs is None:
             if seed is None or isinstance(seed, (int, np.integer)):
@@ -242,212 +494,141 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
-            # starts, pose noise and machines have streams of their own: one leaves the others alone
+            # Starts, pose noise and what a subclass draws have streams of their own, so that one
+            # leaves the others alone.
             streams = [(s, s.generate_state(4), s.generate_state(8)[4:]) for s in seeds]
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
             self.recent_success = [deque(maxlen=10) for _ in seeds]  # a crane's last episodes
-        self.resting[:] = False
-        obs, info = self.start_episodes(np.arange(self.num_envs))
-        return obs, info | {f"_{key}": np.ones(self.num_envs, bool) for key in info}
-
-    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance every crane by one decision, actions (N, 6), and start anew after an end.
-
-        SAME_STEP: where an episode ends, the observation is that of the next start. NEXT_STEP: it
-        is that of the end. The next step ignores the action there and gives the start, reward 0.
-        """
-        obs, reward, terminated, truncated, info = self.advance(actions)
-        done = terminated | truncated
-        of_ends = {"success", "is_success", "gentle", *CONDITIONS}
-        everywhere = np.ones(self.num_envs, bool)
-        info |= {f"_{key}": done if key in of_ends else everywhere for key in info}
-        again = done
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            again, self.resting = self.resting, done.copy()
-        elif done.any():
-            info["final_info"] = info.copy()
-            info["final_obs"] = np.full(self.num_envs, None, dtype=object)
-            for i in np.flatnonzero(done):
-                info["final_obs"][i] = obs[i].copy()
-            info["_final_obs"] = info["_final_info"] = done
-        if again.any():
-            starts, start_info = self.start_episodes(np.flatnonzero(again))
-            obs[again] = starts[again]
-            if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-                reward[again], info["log_speed"][again] = 0.0, 0.0
-                info["time_to_reach"][again] = info["time_up"][again] = np.inf
-                for key, values in (start_info | self.costs.total).items():
-                    info[key][again] = values[again]
-        return obs, reward, terminated, truncated, info
-
-    def advance(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """`step` without autoreset. RuntimeError before `reset`, ValueError for wrong actions."""
-        if self.rngs is None:
-            raise RuntimeError("call reset() before step()")
-        actions = np.asarray(actions, dtype=np.float64)
-        if actions.shape != (self.num_envs, 6):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 6), got {actions.shape}")
-        if not np.isfinite(actions).all():
-            raise ValueError("actions must be finite, got NaN or infinity")
-        actions = np.clip(actions, -1, 1)
-        command = actions * machine.speed_limit(actions, self.speed)
-        diverged = self.simulate(command)
-        self.decisions += 1
-
-        state, time = self.state(), self.decisions * self.dt
-        obs, info = self.observe(state, command)
-        in_time = time < crane_task.REACH_TIME + 1e-9
-        near = (info["d_combine"] < crane_task.REACH_DISTANCE) & in_time
-        self.reach_time = np.minimum(self.reach_time, np.where(near, time, np.inf))
-        reached = np.isfinite(self.reach_time)
-        gripped = crane_task.grip_conditions(info["clearance"], state.touching, info["centre_miss"])
-        self.streaks = (self.streaks + 1) * gripped
-        safe = (self.streaks >= self.hold_decisions).all(axis=0)
-        self.time_up = np.where(safe, np.minimum(self.time_up, time), np.inf)
-
-        bounds, speed = self.joint_range, self.speed
-        ending = crane_task.termination_rule(state, time, reached, diverged, bounds, speed)
-        ending[self.resting] = "none"
-        truncated = ending == "time_limit"
-        terminated = (ending != "none") & ~truncated
-        # Success, for training, evaluation and tests alike: the log was reached in time, each of
-        # the grip's conditions held at every decision of the last HOLD_TIME, nothing ended early.
-        failed = ~np.array([reached, *(self.streaks >= self.hold_decisions)])
-        info |= dict(zip(CONDITIONS, failed)) | {"success": truncated & ~failed.any(axis=0)}
-        info["is_success"] = info["success"]
-        info |= {name: cost.copy() for name, cost in self.costs.total.items()}
-        info["gentle"] = info["success"] & (info["ground_peak"] <= GENTLE_FORCE)
-        info["time_up"] = self.time_up.copy()
-        info["log_speed"] = np.linalg.norm(self.log_velocity[:, :3], axis=-1)
-        info |= {"termination": ending, "time_to_reach": self.reach_time.copy()}
-        reward = sum(info[term] for term in TERMS)
-        for i in np.flatnonzero(ending != "none"):
-            self.recent_success[i].append(bool(info["success"][i]))
-            if not info["success"][i]:
-                self.failures[i].append(self.starts[i])
-        if self.render_mode == "human" and self.watch is None:
+        self.start_episodes(np.arange(self.num_envs))
+        if self.render_mode == "human":
             self.render()
-        return obs, np.where(diverged, 0.0, reward), terminated, truncated, info
+        state = self.state()
+        info = self.measure(state)
+        everywhere = np.ones(self.num_envs, bool)
+        return self.observation(state), info | {f"_{key}": everywhere for key in info}
 
-    def simulate(self, command: Array) -> Array:
-        """frame_skip physics steps under a command (N, 6), rad/s and m/s; which diverged, (N,)."""
-        self.stay_in_process()
-        if not self.hydraulic:
-            self.ctrl[:] = np.tile(command[:, COMMAND_OF_SERVO], 2)  # servos and their integrators
-        failed = np.zeros(self.num_envs, bool)
-        self.costs.impact[:] = 0.0
-        # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
-        # lead keeps squeezing the log at zero command, as a check valve does. If a decision is
-        # shorter than a piece, only every k-th decision of an episode clamps the integrators.
-        piece = machine.VALVE_STEPS if self.hydraulic else ANTI_WINDUP
-        every = max(1, piece // self.frame_skip)
-        due = self.decisions % every == 0
-        for start in range(0, self.frame_skip, piece):
-            position = self.qpos[:, SERVOS]
-            low, high = position - self.max_lead, position + self.max_lead
-            np.clip(self.act, low, high, out=self.act, where=due[:, None])
-            nstep = min(piece, self.frame_skip - start)
-            if self.hydraulic:
-                ids = np.flatnonzero(due)
-                gain = np.where(command < 0, self.drawn["gain"][:, 0], self.drawn["gain"][:, 1])
-                wanted, seconds = (gain * command)[ids], nstep * every * TIMESTEP
-                speed = self.valves.mean_speed(ids, wanted, self.qpos[ids], seconds)
-                self.ctrl[ids, 8:] = speed[:, COMMAND_OF_SERVO]
-            last = start + nstep == self.frame_skip  # sensors are needed after this one only
-            stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
-            try:
-                self.batch.step(nstep=nstep, stage=stage)
-            except SimulationError as error:
-                failed[error.ids] = True
-            self.count_costs(nstep * TIMESTEP)
-            if self.watch is not None:
-                self.watch(nstep * TIMESTEP)
-        finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
-        return failed | self.batch.warning[:, :, 1].any(axis=-1) | ~finite
+    # ---- hooks: the model, the start of an episode
 
-    def count_costs(self, seconds: float) -> None:
-        """Add to `costs` what the last piece of a decision took."""
-        sound = ~self.batch.warning[:, :, 1].any(axis=-1)[:, None]  # the engine reset the others
-        ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1) * sound
-        q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED] * sound
-        force = self.drive_force[:, SERVOS] @ np.eye(6)[COMMAND_OF_SERVO]  # of both stages, jaws
-        self.costs.add(ground, q, dq, force, seconds)
+    def make_spec(self) -> mujoco.MjSpec:
+        """The model: assets/crane.xml with the contacts that the options ask for."""
+        spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+        spec.geom("log").size[1] = LOG_LENGTH / 2
+        spec.sensor("ground_force").nsample = self.PIECE
+        if self.options.contact == "sdf":  # the paper's contacts, integrator and solver
+            spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
+            spec.option.solver = mujoco.mjtSolver.mjSOL_CG
+            # the cheapest search that misses no contact (docs/learned.md)
+            spec.option.sdf_initpoints, spec.option.sdf_iterations = 8, 5
+            # Collision bits of crane.xml: 4 is the log's. 8 collides with nothing, but a geom
+            # without any bit counts as only drawn.
+            spec.geom("log").contype, spec.geom("log_capsule").contype = 4, 8
+            for geom in spec.geoms:
+                if geom.classname.name == "jaw_mesh":
+                    geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_SDF, 4
+                elif geom.classname.name == "jaw_collision":
+                    geom.conaffinity &= ~4
+        return spec
 
-    def start_episodes(self, ids: Array) -> tuple[Array, dict[str, Array]]:
-        """New episodes in cranes `ids`; observations and info of all cranes."""
-        for i in ids:
-            (start_rng, noise_rng, machine_rng), failures = self.rngs[i], self.failures[i]
-            retry = self.options["retry"] * np.mean(self.recent_success[i] or 0.0)  # 0 at first
-            if retry and failures and start_rng.random() < retry:
-                self.starts[i] = failures[start_rng.integers(len(failures))]
-            else:
-                self.starts[i] = crane_task.sample_start(start_rng)
-            bound = crane_task.POSE_NOISE
-            self.noise[i] = noise_rng.uniform(-bound, bound, self.noise[i].shape)
-            if self.options["randomize"]:
-                drawn = machine.draw_machine(machine_rng, self.options["randomize"])
-                for name, values in self.drawn.items():
-                    values[i] = drawn[name]
-        starts = [self.starts[i] for i in ids]
-        if self.difficulty < 1:
-            starts = [crane_task.ease_start(*start, self.difficulty) for start in starts]
-        q, log_pose, diameter = (np.array(part) for part in zip(*starts))
-        q[:, 4:6] += self.drawn["swing"][ids]
+    def start_episodes(self, ids: Array) -> None:
+        """New episodes in cranes `ids`."""
+        q, log_pose, diameter = (
+            np.array(part) for part in zip(*[self.draw_episode(i) for i in ids])
+        )
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
-        if self.render_mode == "human":
-            self.render()
-        return self.observe(self.state(), np.zeros((self.num_envs, 6)))
+
+    def draw_episode(self, i: int) -> tuple[Array, Array, float]:
+        """Draw crane i's next start, as `sample_start` gives it, and its pose errors."""
+        if not 0 <= self.difficulty <= 1:
+            raise ValueError(f"difficulty must be in [0, 1], got {self.difficulty}")
+        start_rng, noise_rng, _ = self.rngs[i]
+        failures = self.failures[i]
+        retry = self.retry * np.mean(self.recent_success[i] or 0.0)  # 0 at first
+        if retry and failures and start_rng.random() < retry:
+            self.starts[i] = failures[start_rng.integers(len(failures))]
+        else:
+            self.starts[i] = sample_start(start_rng)
+        self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
+        if self.difficulty < 1:
+            return ease_start(*self.starts[i], self.difficulty)
+        return self.starts[i]
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
-        self.stay_in_process()
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         radius, (x, y, yaw) = diameter / 2, log_pose.T
         # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
         self.batch.joint("log").qpos[ids] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
         self.qpos[np.ix_(ids, JOINTS)] = q
-        self.qpos[np.ix_(ids, SERVOS)] = q[:, ACTUATED][:, COMMAND_OF_SERVO]
-
-        mass = self.drawn["density"][ids] * np.pi * radius**2 * LOG_LENGTH
-        across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
-        log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
-        self.log_size[ids, 0] = capsule.size[ids, 0] = radius
-        capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
-        log.mass[ids, 0] = mass
-        log.inertia[ids] = np.stack([across, across, along], axis=-1)
-        if self.options["randomize"]:
-            self.set_machine(ids)
+        self.qpos[np.ix_(ids, SERVOS)] = q[:, ACTUATED][:, ACTION_OF_SERVO]
+        self.set_constants(ids, radius)
         self.batch.set_const(ids)  # bounding volumes and inverse weights follow
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
         self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp[ids]
-        self.valves.close(ids)
-        self.decisions[ids] = 0
-        self.reach_time[ids] = self.time_up[ids] = np.inf
-        self.costs.clear(ids)
-        self.streaks[:, ids] = 0
+        self.steps[ids] = 0
+        self.reach_time[ids] = np.inf
+        for of_last_episode in (self.command, self.impact, self.ground_peak):
+            of_last_episode[ids] = 0
+        for streak in self.streaks.values():
+            streak[ids] = 0
 
-    def set_machine(self, ids: Array) -> None:
-        """Give the engine what was drawn for cranes `ids`. Ideal servos keep their gains."""
-        friction = self.model.geom_friction * self.drawn["friction"][ids, None, None]
-        self.engine["geom_friction"][ids] = friction
-        if not self.hydraulic:
-            return
-        stiffness = self.drawn["stiffness"][ids][:, COMMAND_OF_SERVO]
-        self.servo_kp[ids] = stiffness
-        self.max_lead[ids] = self.model.jnt_actfrcrange[SERVOS, 1] / stiffness
-        self.engine["actuator_gainprm"][ids, 8:, 0] = stiffness
-        self.engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
-        damping = self.drawn["damping"][ids][:, COMMAND_OF_SERVO]
-        self.engine["dof_damping"][np.ix_(ids, SERVOS)] = damping
-        delay = self.model.actuator_delay[8:] + self.drawn["extra_delay"][ids, None]
-        self.engine["actuator_delay"][ids, 8:] = delay
+    def set_constants(self, ids: Array, radius: Array) -> None:
+        """Write to the engine what differs between episodes: the log of radius (n,), in m."""
+        mass = self.density[ids] * np.pi * radius**2 * LOG_LENGTH
+        across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
+        log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
+        self.batch.geom("log").size[ids, 0] = capsule.size[ids, 0] = radius
+        capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
+        log.mass[ids, 0] = mass
+        log.inertia[ids] = np.stack([across, across, along], axis=-1)
+
+    # ---- hooks: what moves the joints
+
+    def simulate(self) -> Array:
+        """frame_skip physics steps under `command`; which cranes diverged, (N,)."""
+        failed = np.zeros(self.num_envs, bool)
+        self.impact[:] = 0.0
+        # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
+        # lead keeps squeezing the log at zero command, as a check valve does. If a step is shorter
+        # than a piece, only every k-th step of an episode begins a piece.
+        every = max(1, self.PIECE // self.frame_skip)
+        due = self.steps % every == 0
+        for start in range(0, self.frame_skip, self.PIECE):
+            nstep = min(self.PIECE, self.frame_skip - start)
+            position = self.qpos[:, SERVOS]
+            low, high = position - self.max_lead, position + self.max_lead
+            np.clip(self.act, low, high, out=self.act, where=due[:, None])
+            self.drive(np.flatnonzero(due), nstep * every * self.model.opt.timestep)
+            last = start + nstep == self.frame_skip  # sensors are needed after this one only
+            stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
+            try:
+                self.batch.step(nstep=nstep, stage=stage)
+            except SimulationError as error:
+                failed[error.ids] = True
+            ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1)
+            ground[self.warned()] = 0.0  # the engine has reset them
+            self.impact = np.maximum(self.impact, ground.max(axis=-1))
+            self.ground_peak = np.maximum(self.ground_peak, self.impact)
+            for observer in self.observers:
+                observer(self, nstep * self.model.opt.timestep)
+        finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
+        return failed | self.warned() | ~finite
+
+    def warned(self) -> Array:
+        """Which cranes the engine has warned of since their start, (N,) bool."""
+        return self.batch.warning[:, :, 1].any(axis=-1)
+
+    def drive(self, ids: Array, seconds: float) -> None:
+        """Set `ctrl` of cranes `ids` for the next seconds: that of servos and their integrators."""
+        self.ctrl[:] = np.tile(self.command[:, ACTION_OF_SERVO], 2)
+
+    # ---- hooks: what is observed, measured, rewarded, and what ends an episode
 
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
@@ -455,91 +636,117 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # as in crane.xml; sensors of your own go behind the crane's force on the ground
         parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17, 20], axis=1)
         *poses, touch, support, pressure, _ = parts
-        weight = 9.81 * self.batch.body("log").mass[:, 0]
+        weight = -self.model.opt.gravity[2] * self.batch.body("log").mass[:, 0]
         ground = np.linalg.norm(support, axis=-1) + np.linalg.norm(pressure, axis=-1)
         carried = np.clip(1 - ground / weight, 0, 1)
-        return CraneState(q, dq, *poses, touch > 0, 2 * self.log_size[:, 0], carried)
+        diameter = 2 * self.batch.geom("log").size[:, 0]
+        return CraneState(q, dq, *poses, touch > 0, diameter, carried)
 
-    def observe(self, state: CraneState, command: Array) -> tuple[Array, dict[str, Array]]:
-        """Observations (N, 18 or 32) with sensor errors, float32; info and reward terms without."""
-        delta_p, delta_psi, signed_angle = crane_task.relative_pose(state, self.options["offset"])
-        d_combine = np.linalg.norm(delta_p, axis=-1) + delta_psi
-        clearance, miss = crane_task.log_clearance(state), crane_task.centre_miss(state)
-        kind, drives, impact = self.options["reward"], self.options["actuators"], self.costs.impact
-        info = {"d_combine": d_combine, "clearance": clearance, "centre_miss": miss}
-        info |= {"diameter": state.diameter, "log_mass": self.batch.body("log").mass[:, 0].copy()}
-        above = 0.0 if kind == "paper" else crane_task.CLOSING_HEIGHT
-        distance = np.linalg.norm(delta_p + [0, 0, above], axis=-1) + delta_psi
-        terms = crane_task.reward_terms(
-            state, distance, clearance, miss, command, impact, self.difficulty, kind, drives
-        )
-        info |= dict(zip(TERMS, np.where(np.isnan(terms), 0.0, terms)))  # NaN where it diverged
-        if self.options["randomize"]:
-            info |= {f"drawn_{name}": values.copy() for name, values in self.drawn.items()}
-        delta_p, q = delta_p + self.drawn["pose_error"], state.q + self.drawn["joint_error"]
-        angle = signed_angle + self.drawn["yaw_error"]
-        if not self.options["signed_yaw"]:
-            change = np.abs(np.cos(signed_angle)) - np.abs(np.cos(angle))
-            angle = np.clip(delta_psi + change, 0, 1)  # Delta_psi with the error of the yaw
-        if self.options["pose_noise"] != "none":
-            now = np.minimum(self.decisions, self.noise.shape[1] - 1)
-            epsilon = self.noise[np.arange(len(now)), now]
-            delta_p, angle = crane_task.noisy_pose(delta_p, angle, epsilon)
-        if self.options["axes"] == "crane":
+    def observation(self, state: CraneState) -> Array:
+        """`observe` as float32 (N, n) within the space, 0 for what diverged."""
+        space = self.single_observation_space
+        obs = np.nan_to_num(self.observe(state), nan=0.0, posinf=np.inf, neginf=-np.inf)
+        return np.clip(obs, space.low, space.high).astype(np.float32, order="C")
+
+    def observation_limits(self) -> Array:
+        """Lowest and highest value of each number of `observe`, (2, n)."""
+        low, high = self.joint_range.T + np.array([[-0.5], [0.5]])
+        bound = np.repeat([10.0, 20.0, 1.5 * np.pi], [6, 3, 1])  # dq, Delta_p, its angle
+        return np.array([[*low, *-bound], [*high, *bound]])
+
+    def observe(self, state: CraneState) -> Array:
+        """Observations (N, n). A subclass adds columns, and their limits to observation_limits."""
+        delta_p, delta_psi, angle = relative_pose(state, self.options.offset)
+        if not self.options.signed_yaw:
+            angle = delta_psi
+        if self.options.pose_noise != "none":
+            now = np.minimum(self.steps, self.noise.shape[1] - 1)
+            delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
+        if self.options.axes == "crane":
             cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), delta_p.T
             delta_p = np.array([cos * x + sin * y, cos * y - sin * x, z]).T
-        parts = [q, state.dq, delta_p, angle[:, None]]
-        if self.options["sensors"]:
-            force = self.servo_kp * (self.act - self.qpos[:, SERVOS])
-            force += self.servo_kv * (self.ctrl[:, :8] - self.qvel[:, SERVOS])
-            limit_of_force = self.model.jnt_actfrcrange[SERVOS, 1]
-            force = np.clip(force / limit_of_force, -1, 1)[:, machine.FIRST_SERVO]
-            last_command = command / machine.speed_limit(command, self.speed)
-            parts += [last_command, self.qvel[:, JOINTS][:, PASSIVE], force]
-        obs = np.concatenate(parts, axis=-1)
-        obs[np.isnan(obs)] = 0  # of a crane that diverged
-        space = self.single_observation_space
-        return np.clip(obs, space.low, space.high).astype(np.float32, order="C"), info
+        return np.concatenate([state.q, state.dq, delta_p, angle[:, None]], axis=-1)
 
-    def stay_in_process(self) -> None:
-        """RuntimeError in a forked process, which has none of the threads."""
-        if os.getpid() != self.process and self.batch.nthread > 1:
-            raise RuntimeError("make the cranes after the fork, or with env_threads=1")
+    def measure(self, state: CraneState) -> dict[str, Array]:
+        """What `info` says of all cranes."""
+        delta_p, delta_psi, _ = relative_pose(state, self.options.offset)
+        return {
+            "d_combine": np.linalg.norm(delta_p, axis=-1) + delta_psi,
+            "clearance": log_clearance(state),
+            "centre_miss": centre_miss(state),
+            "diameter": state.diameter,
+            "log_mass": self.batch.body("log").mass[:, 0].copy(),
+            "ground_peak": self.ground_peak.copy(),
+        }
 
-    def __reduce__(self) -> None:
-        raise TypeError("cranes cannot be copied or pickled; make new ones")
+    def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """The reward's terms, (N,) each, by name. Their sum is the reward."""
+        if self.options.reward == "paper":
+            return paper_terms(state, info["d_combine"], self.command)
+        delta_p, delta_psi, _ = relative_pose(state, self.options.offset)
+        distance = np.linalg.norm(delta_p + [0, 0, CLOSING_HEIGHT], axis=-1) + delta_psi
+        clearance, miss = info["clearance"], info["centre_miss"]
+        grasp = self.grasp(state, miss)
+        terms = staged_terms(state, distance, clearance, miss, self.command, *grasp)
+        # An easy task forgives hits: a crane that does not lift yet would learn to stay away.
+        weight = self.GROUND_WEIGHT * self.difficulty**4
+        hardness = np.clip(2 * self.impact / GENTLE_FORCE - 1, 0, self.GROUND_MOST)
+        return terms | {"r_ground": -weight * hardness}
 
-    @property
-    def difficulty(self) -> float:
-        """From 0 (easy) to 1 (the full task). It acts on r_ground at once, then on starts."""
-        return self._difficulty
+    def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
+        """closed and grip of `staged_terms`."""
+        return state.q[:, 7] / Q8_MAX, centred(miss)
 
-    @difficulty.setter
-    def difficulty(self, value: float) -> None:
-        check({"difficulty": value}, Options)
-        self._difficulty = value
+    def rules(self, state: CraneState, diverged: Array) -> dict[str, Array]:
+        """What ends an episode early (Sec. IV-B3), (N,) bool each, by name. The first counts."""
+        q, (low, high) = state.q, self.joint_range.T
+        beyond = (q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE)
+        away = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
+        late = self.steps * self.dt > self.REACH_TIME - 1e-9
+        return {
+            "diverged": diverged,
+            # not q8: the jaws' end stops are part of grasping
+            **{f"joint_limit_q{k + 1}": beyond[:, k] for k in range(7)},
+            "overspeed": (np.abs(state.dq) > 2 * speed_limit(state.dq)).any(axis=-1),
+            "log_too_far": away > LOG_RANGE,
+            "not_reached": late & np.isinf(self.reach_time),
+        }
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """The attribute, once a crane, as Gymnasium's SyncVectorEnv gives it."""
-        return (getattr(self, name),) * self.num_envs
+    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """What must hold throughout the last HOLD_TIME, (N,) bool each, named by its failure."""
+        return {
+            "not_lifted": info["clearance"] >= MIN_CLEARANCE,
+            "not_held": state.touching.all(axis=-1),
+            "off_centre": info["centre_miss"] <= MAX_MISS,
+        }
 
-    def set_attr(self, name: str, values: Any) -> None:
-        """Set the difficulty, which all cranes share: one value, or a list of N equal ones."""
-        values = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
-        if name != "difficulty":
-            raise AttributeError(f"only difficulty can be set, not {name}; make other cranes")
-        if values != values[:1] * self.num_envs:
-            raise ValueError("all cranes share difficulty: give one value or N equal ones")
-        self.difficulty = values[0]
+    # ---- pictures
 
     def render(self) -> tuple[Array, ...] | None:
-        """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in `viewer`."""
-        if self.render_mode is not None and self.viewer is None:
-            import crane_view  # needs libraries that nothing else does
+        """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in a window."""
+        if self.render_mode is None:
+            return None
+        if self.viewer is None:
+            self.scene = self.batch.get_model(0), self.batch.get_data(0)
+            if self.render_mode == "human":
+                import mujoco.viewer
 
-            kind = crane_view.Window if self.render_mode == "human" else crane_view.Photographer
-            self.viewer = kind(self)
-        return self.viewer.show() if self.viewer else None
+                self.viewer = mujoco.viewer.launch_passive(*self.scene)
+            else:
+                self.viewer = mujoco.Renderer(self.scene[0], *self.frame_size)
+        if self.render_mode == "human":
+            with self.viewer.lock():
+                self.batch.get_model(0, self.scene[0])
+                self.batch.get_data(0, self.scene[1])
+            self.viewer.sync()
+            return None
+        return tuple(self.picture(i, self.camera) for i in range(self.num_envs))
+
+    def picture(self, i: int, camera: str) -> Array:
+        """What a camera sees of crane i, (height, width, 3), uint8."""
+        self.batch.get_model(i, self.viewer.model)
+        self.viewer.update_scene(self.batch.get_data(i), camera)
+        return self.viewer.render()
 
     def close_extras(self, **kwargs: Any) -> None:
         if self.viewer is not None:
@@ -547,74 +754,54 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.viewer = None
 
 
-def outlive_fork() -> None:
-    """Keep all cranes alive in a forked process: their end would wait for threads for ever."""
-    for envs in ALIVE:
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(envs.batch))
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=outlive_fork)
-
-
 class CraneEnv(gymnasium.Env):
-    """One crane: a view of `CraneVectorEnv`, without its num_envs and autoreset_mode."""
+    """One crane of `cranes`: a view of `CraneVectorEnv`, for reading, check_env and wrappers.
 
-    metadata = CraneVectorEnv.metadata
-    __reduce__ = CraneVectorEnv.__reduce__
-    _spec: EnvSpec | None = None
+    A task of your own has one crane too: class MyCraneEnv(CraneEnv): cranes = MyCranes.
+    """
+
+    metadata = {"render_modes": CraneVectorEnv.metadata["render_modes"]}
+    cranes = CraneVectorEnv
 
     def __init__(self, **kwargs: Any):
-        if "autoreset_mode" in kwargs:
-            raise ValueError("one crane has no autoreset_mode: reset() it after an episode")
-        self.envs = CraneVectorEnv(num_envs=1, **{"env_threads": 1, **kwargs})
-        self.metadata = {k: v for k, v in self.envs.metadata.items() if k != "autoreset_mode"}
+        self.envs = self.cranes(num_envs=1, autoreset=False, **{"env_threads": 1, **kwargs})
+        self.metadata = {**self.metadata, "render_fps": self.envs.metadata["render_fps"]}
         self.render_mode = self.envs.render_mode
         self.observation_space = self.envs.single_observation_space
         self.action_space = self.envs.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
-        obs, info = self.envs.reset(seed=seed, options=options)
-        return obs[0], {key: value[0] for key, value in info.items() if not key.startswith("_")}
+        obs, info = self.envs.reset(seed=seed)
+        return obs[0], self.of_one(info)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        if np.shape(action) != self.action_space.shape:
-            raise ValueError(f"an action must have shape (6,), got {np.shape(action)}")
-        obs, reward, terminated, truncated, info = self.envs.advance(np.asarray(action)[None])
-        info = {key: value[0] for key, value in info.items()}
-        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        """`CraneVectorEnv.step` without autoreset. action (6,)."""
+        results = self.envs.step(np.asarray(action)[None])
+        obs, (reward, terminated, truncated), info = results[0], results[1:4], results[4]
+        return obs[0], reward.item(), terminated.item(), truncated.item(), self.of_one(info)
 
-    @property
-    def difficulty(self) -> float:
-        """As `CraneVectorEnv.difficulty`."""
-        return self.envs.difficulty
-
-    @difficulty.setter
-    def difficulty(self, value: float) -> None:
-        self.envs.difficulty = value
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium knows of the task, with the length of an episode in decisions."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        # The registered task cannot have this length: it depends on frame_skip. For the same
-        # reason a make() from this spec with another frame_skip needs max_episode_steps=-1.
-        self._spec = spec and replace(spec, max_episode_steps=self.envs.max_decisions)
+    def of_one(self, info: dict[str, Array]) -> dict[str, Any]:
+        """The one crane's info, in Python's numbers, bools and strings."""
+        one = {key: value[0] for key, value in info.items() if not key.startswith("_")}
+        return {key: value.item() if np.ndim(value) == 0 else value for key, value in one.items()}
 
     def render(self) -> Array | None:
         frames = self.envs.render()
-        return None if frames is None else frames[0]
+        return frames and frames[0]
 
     def close(self) -> None:
         self.envs.close()
 
 
-CLASSES = {"entry_point": "crane_env:CraneEnv", "vector_entry_point": "crane_env:CraneVectorEnv"}
-gymnasium.register("ForestryCrane-v0", **CLASSES)
-gymnasium.register("ForestryCranePaper-v0", kwargs=crane_options.PAPER, **CLASSES)
-gymnasium.register("ForestryCraneHydraulic-v0", kwargs=crane_options.HYDRAULIC, **CLASSES)
-gymnasium.register("ForestryCraneRandomized-v0", kwargs=crane_options.RANDOMIZED, **CLASSES)
+ONE, MANY = "crane_env:CraneEnv", "crane_env:CraneVectorEnv"
+PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
+PAPER |= {"signed_yaw": False, "axes": "world"}
+gymnasium.register("ForestryCrane-v0", ONE, vector_entry_point=MANY)
+gymnasium.register("ForestryCranePaper-v0", ONE, vector_entry_point=MANY, kwargs=PAPER)
+# beyond the paper: hydraulic_crane.py
+ONE, MANY = "hydraulic_crane:HydraulicCraneEnv", "hydraulic_crane:HydraulicCraneVectorEnv"
+gymnasium.register("ForestryCraneHydraulic-v0", ONE, vector_entry_point=MANY)
+gymnasium.register(
+    "ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs={"randomize": 1.0}
+)

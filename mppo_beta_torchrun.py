@@ -5,87 +5,81 @@ This is mppo_beta_crane.py, except that each rank has a share of the cranes and 
 divergence that stops an update, and the statistics of advantages and observations. So all have the
 same weights. The observation normalizer changes after each rollout and not in it, so the first
 rollout has raw observations. Rank 0 evaluates, and writes what it has seen.
-Several machines, and what to expect of 8, 64 and 512 cores: docs/speed.md.
+Several machines, and what to expect of more cores: docs/speed.md.
 
     torchrun --standalone --nproc-per-node 2 mppo_beta_torchrun.py
 """
 
-import atexit
 import os
 import time
 from collections import defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 # OpenMP workers spin briefly before they sleep: low latency, and two runs can share two cores.
 os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
-import gymnasium
 import numpy as np
 import torch
 import torch.distributed as dist
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.distributions import Beta
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
 
-import crane_env
-import crane_options
-import crane_runs
-import crane_trials
-from crane_options import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
+from crane_env import STRICT, Options
+from crane_utils import runs, trials
+from crane_utils.runs import Count, Factor, Share
 
-ALGORITHM = "mppo_beta"
 A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is -inf at 0 and 1
 LOG_EXCESS_MAX = 5.0  # bound of log(alpha - 1) and log(beta - 1)
 
 
-@dataclass
+@dataclass(config=STRICT)
 class Args:
-    # experiment
+    # run
     exp_name: str = Path(__file__).stem  # part of the run's folder name
-    seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
-    total_timesteps: Count = 1_024_000  # decisions of all cranes together, in whole rollouts
+    seed: Annotated[int, Field(ge=0)] = 1  # of the networks, the policy's samples and the episodes
+    total_timesteps: Count = 1_024_000  # steps of all cranes together, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: Annotated[int, Range(1, 256)] = 1  # CPU threads of an update
-    env_threads: Threads = 1  # CPU threads of the physics, 0 for all cores
+    threads: Count = 1  # CPU threads of physics and updates, of each rank
+    eval_every: Count = 25  # updates between evaluations
+    eval_trials: Count = 20  # trials per log diameter in each evaluation
+    final_trials: Count = 100  # the same after the last update
     resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 
     # task
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
-    num_envs: Size = 64  # cranes simulated side by side
-    env: crane_options.Options = field(default_factory=lambda: {"retry": 0.5})
-    """options of the crane: those of the task, except retry; (task: x): that of ForestryCrane-v0"""
-    warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
+    num_envs: Count = 64  # cranes simulated side by side
+    env: Options = field(default_factory=Options)  # options of the task; its --help shows its own
 
     # algorithm
-    num_steps: Size = 64  # decisions per crane and rollout
-    hidden_sizes: tuple[Width, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    normalize_obs: bool = True  # scale observations by their running mean and std
+    num_steps: Count = 64  # steps per crane and rollout
+    hidden_sizes: tuple[Count, ...] = (256, 256)  # hidden layers of the actor and of the critic
     learning_rate: Factor = 1e-3  # Adam's step size at the start
-    gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
-    gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
-    minibatch_size: Count = 1024  # decisions per gradient step
-    update_epochs: Times = 8  # passes over each rollout
+    gamma: Share = 0.97  # discount per step at the start
+    gae_lambda: Share = 0.95  # lambda of the advantage estimate, per step
+    reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
+    minibatch_size: Annotated[int, Field(ge=2)] = 1024  # steps per gradient step
+    update_epochs: Count = 8  # passes over each rollout
     clip_coef: Factor = 0.2  # c, bound of the ratio's change
-    target_kl: Factor | None = 0.04  # stop after the first epoch whose mean KL exceeds this
+    target_kl: Factor = 0.04  # stop after the first epoch whose mean KL exceeds this
     ent_coef: Factor = 0.0  # c_e, weight of the entropy
     vf_coef: Factor = 0.5  # c_v, weight of the value loss
     max_grad_norm: Factor = 0.5  # bound of the gradient's norm
     perturbation: Share = 0.1  # eps at the start, half width of the perturbation of a_n
-    perturbed: Annotated[float, Range(0.01, 1)] = 0.4  # share of the run in which eps falls to 0
-    log_excess_init: Exponent = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
-    narrowing: Exponent = 2.5  # rise of the actor's outputs by schedule, before the bound
+    log_excess_init: float = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
 
-    # evaluation
-    eval_every: Annotated[int, Range(0, 10**10)] = 25  # updates between evaluations, 0 for none
-    eval_trials: Times = 20  # trials per log diameter in each evaluation
-    final_trials: Annotated[int, Range(0, 1000)] = 100  # the same after the training, 0 for none
-    eval_seed: Seed = 10_000  # seed of all trials
-
-    def __post_init__(self) -> None:
-        crane_options.check(vars(self), Args)
+    # schedules (docs/training.md)
+    curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
+    retry: Share = 0.5  # largest share of episodes that repeat a failed start
+    perturbed: Annotated[float, Field(gt=0, le=1)] = 0.4  # share of the run in which eps falls to 0
+    horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
+    narrowing: float = 2.5  # rise of the actor's outputs in the run, before the bound
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -94,12 +88,11 @@ def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
     return layer
 
 
-def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for width in hidden_sizes:
-        layers += [layer_init(nn.Linear(inputs, width)), nn.Tanh()]
-        inputs = width
-    return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
+def mlp(sizes: list[int], std: float) -> nn.Sequential:
+    layers = []
+    for inputs, outputs in pairwise(sizes[:-1]):
+        layers += [layer_init(nn.Linear(inputs, outputs)), nn.Tanh()]
+    return nn.Sequential(*layers, layer_init(nn.Linear(*sizes[-2:]), std))
 
 
 class Agent(nn.Module):
@@ -107,10 +100,9 @@ class Agent(nn.Module):
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
-        self.normalize_obs = args.normalize_obs
-        self.actor = mlp(obs_dim, args.hidden_sizes, 2 * len(action_low), std=0.01)
+        self.actor = mlp([obs_dim, *args.hidden_sizes, 2 * len(action_low)], std=0.01)
         nn.init.constant_(self.actor[-1].bias, args.log_excess_init)
-        self.critic = mlp(obs_dim, args.hidden_sizes, 1, std=1.0)
+        self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
         self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
         self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
@@ -120,8 +112,7 @@ class Agent(nn.Module):
     def update_normalizer(self, obs: Tensor) -> None:
         """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
         obs, new = obs.double(), len(obs) * dist.get_world_size()
-        mean = average(obs.mean(0))
-        count = self.obs_count + new
+        count, mean = self.obs_count + new, average(obs.mean(0))
         delta = mean - self.obs_mean
         spread = self.obs_var * self.obs_count + average(((obs - mean) ** 2).mean(0)) * new
         self.obs_var.copy_((spread + delta**2 * self.obs_count * new / count) / count)
@@ -129,14 +120,11 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std, clipped to +-10; obs itself without normalize_obs."""
-        if not self.normalize_obs:
-            return obs
+        """(obs - mean) / std, clipped to +-10."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
     def get_value(self, obs: Tensor) -> Tensor:
-        """V(s), (B,)."""
         return self.critic(obs).squeeze(-1)
 
     def get_distribution(self, obs: Tensor) -> Beta:
@@ -150,29 +138,24 @@ class Agent(nn.Module):
         return (self.action_low + (self.action_high - self.action_low) * actions).cpu().numpy()
 
     @torch.no_grad()
-    def predict(
-        self, obs: np.ndarray, state: None = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, None]:
+    def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
         """Actions (B, act_dim) for raw obs (B, obs_dim), and None: it has no memory."""
         obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
         distribution = self.get_distribution(self.normalize(obs))
         return self.to_env(distribution.mean if deterministic else distribution.sample()), None
 
 
-def perturb_actions(actions: Tensor, epsilon: float) -> Tensor:
-    """Eq. (robust ppo): clip(a_n + g, 0, 1) with g ~ U(-epsilon, epsilon), A_MIN off 0 and 1."""
-    noise = torch.empty_like(actions).uniform_(-1, 1) * epsilon
-    return (actions + noise).clamp(A_MIN, 1 - A_MIN)
+def average(x: Tensor) -> Tensor:
+    """The mean over all ranks of x, which is overwritten."""
+    dist.all_reduce(x)
+    return x / dist.get_world_size()
 
 
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
-
-    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
-    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
-    """
+    """Advantages (T, N). dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]), and
+    next_value (N,) is V after the last step."""
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
@@ -183,24 +166,12 @@ def compute_gae(
     return advantages
 
 
-def average(x: Tensor) -> Tensor:
-    """The mean over all ranks of x, which is overwritten. SystemExit if a rank is gone."""
-    try:
-        dist.all_reduce(x)
-    except RuntimeError as error:
-        raise SystemExit(f"another rank is gone; go on with --resume ({error!s:.60})") from None
-    return x / dist.get_world_size()
-
-
 if __name__ == "__main__":
+    all_args, checkpoint = runs.parse(Args, __doc__)
     if not dist.is_torchelastic_launched():
-        crane_runs.read_arguments(ALGORITHM, Args, __doc__)  # --help
         raise SystemExit(f"start it as: torchrun --standalone --nproc-per-node 2 {__file__}")
     dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-    # also at an early exit, where the threads of the group may abort the rank
-    atexit.register(lambda: dist.is_initialized() and dist.destroy_process_group())
     rank, world_size = dist.get_rank(), dist.get_world_size()
-    all_args, checkpoint = crane_runs.share_arguments(ALGORITHM, Args, __doc__)
     if all_args.num_envs % world_size or all_args.minibatch_size % world_size:
         raise SystemExit(f"--num-envs and --minibatch-size must be multiples of {world_size} ranks")
     args = replace(all_args, num_envs=all_args.num_envs // world_size)  # this rank's share
@@ -209,65 +180,59 @@ if __name__ == "__main__":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
-    if args.minibatch_size == 1 or batch_size % args.minibatch_size == 1:
-        raise SystemExit("--minibatch-size leaves a single decision, with no standard deviation")
+    num_iterations = max(1, args.total_timesteps // (world_size * batch_size))
 
     def to_tensor(x: np.ndarray) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float32, device=device)
 
+    def difficulty(iteration: int) -> float:  # easy starts first; 1 is the full task
+        return min(1.0, iteration / num_iterations / max(args.curriculum, 1e-9))
+
     # Environments
-    try:
-        envs = crane_trials.make_envs(args.env_id, args.num_envs, args.env_threads, **args.env)
-    except (gymnasium.error.Error, ImportError, crane_options.OptionError) as error:
-        raise SystemExit(f"{args.env_id}: {error}") from None
+    evaluation = {"threads": args.threads, "options": asdict(args.env)}
+    envs = trials.make_envs(args.env_id, args.num_envs, **evaluation, retry=args.retry)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    if not action_space.is_bounded():
-        raise SystemExit(f"{args.env_id} has unbounded actions, and a Beta needs bounds")
-    is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
-    full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
+    assert action_space.is_bounded(), f"a Beta policy needs bounds, and {action_space} has none"
 
     # Agent
     torch.manual_seed(args.seed)
-    torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
+    torch.set_num_threads(args.threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    # With --resume it loads weights and optimizer. From here on Ctrl-C waits for the update.
-    run = crane_runs.Run(ALGORITHM, all_args, envs, agent, optimizer, checkpoint, rank)
+    first_iteration, env_seed = runs.restore(args, checkpoint, agent, optimizer)
     for weights in agent.state_dict().values():
         dist.broadcast(weights, 0)  # another CPU may round them otherwise
-    seeds = np.random.SeedSequence(run.env_seed).generate_state(all_args.num_envs)
+    seeds = np.random.SeedSequence(env_seed).generate_state(all_args.num_envs)
     seeds = np.split(seeds, world_size)[rank].tolist()
     torch.manual_seed(seeds[0])  # from now on each rank samples for itself
 
-    def set_difficulty(iteration: int) -> None:
-        """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        so_far = iteration / run.num_iterations
-        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
-        if is_crane:
-            envs.unwrapped.difficulty = full_difficulty * share
+    stop = runs.StopSignal()
+    if rank == 0:
+        folder, done = runs.make_folder(args), (first_iteration - 1) * world_size * batch_size
+        writer, lines = SummaryWriter(folder, purge_step=done + 1), asdict(all_args).items()
+        writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in lines))
 
     # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
+    envs.unwrapped.difficulty = difficulty(first_iteration)  # it shapes the first starts
     next_obs = to_tensor(envs.reset(seed=seeds)[0])
-    for iteration in run.iterations():
+    todo = range(first_iteration, num_iterations + 1)
+    count = {"initial": first_iteration - 1, "total": num_iterations, "disable": rank > 0}
+    for iteration in (bar := tqdm(todo, **count)):
         # Schedules
-        progress = (iteration - 1.0) / run.num_iterations
+        progress = (iteration - 1.0) / num_iterations
         left = 1.0 - progress
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         epsilon = args.perturbation * max(0.0, 1 - progress / args.perturbed)
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
-        gamma = (1 - (1 - args.gamma) / growth) ** tenths
-        reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
-        narrowing = args.narrowing / run.num_iterations
-        set_difficulty(iteration)
+        gamma = 1 - (1 - args.gamma) / growth
+        reward_scale = args.reward_scale / growth  # V keeps its size as the horizon grows
+        envs.unwrapped.difficulty = difficulty(iteration)
 
         # Rollout
-        rollout_start = time.time()
+        start = time.perf_counter()
         torch.set_num_threads(1)  # the batches are too small for more
         infos, raw_obs = [], []
         for step in range(args.num_steps):
@@ -275,28 +240,29 @@ if __name__ == "__main__":
                 raw_obs.append(next_obs)
                 obs[step] = agent.normalize(next_obs)
                 action = agent.get_distribution(obs[step]).sample()
-            actions[step] = perturb_actions(action, epsilon)
+            noise = epsilon * torch.empty_like(action).uniform_(-1, 1)  # Eq. (robust ppo)
+            actions[step] = (action + noise).clamp(A_MIN, 1 - A_MIN)
             next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
             next_obs = to_tensor(next_obs)
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = to_tensor(terminated | truncated)
             infos.append(info)
-            cut = truncated & ~terminated  # bootstrap: V stands for what the time limit cut off
-            if cut.any():
+            cut = truncated & ~terminated
+            if cut.any():  # bootstrap: V stands for what the time limit cut off
                 final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))
                 with torch.no_grad():
                     rewards[step, cut] += gamma * agent.get_value(final_obs)
 
-        # Advantages
-        update_start = time.time()
-        torch.set_num_threads(args.torch_threads)
+        # Advantages. The policy was frozen in the rollout: values and log-probabilities of all its
+        # steps come in one batch here, and not one by one in the loop above.
+        torch.set_num_threads(args.threads)
         b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
         with torch.no_grad():
+            agent.update_normalizer(torch.cat(raw_obs))  # no rank waits for others in a rollout
             values = agent.get_value(b_obs).view_as(rewards)
             b_logprobs = agent.get_distribution(b_obs).log_prob(b_actions).sum(-1)
             next_value = agent.get_value(agent.normalize(next_obs))
-            agent.update_normalizer(torch.cat(raw_obs))  # no rank waits for others in a rollout
-        advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda**tenths)
+        advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda)
         b_advantages, b_returns = advantages.flatten(), (advantages + values).flatten()
 
         # Update
@@ -315,46 +281,56 @@ if __name__ == "__main__":
                 value_loss = ((agent.get_value(b_obs[mb]) - b_returns[mb]) ** 2).mean()
                 entropy = distribution.entropy().sum(-1).mean()
                 loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
-
                 optimizer.zero_grad()
                 loss.backward()
                 grads = [parameter.grad for parameter in agent.parameters()]
                 nn.utils.vector_to_parameters(average(nn.utils.parameters_to_vector(grads)), grads)
                 grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
                 optimizer.step()
-
                 epoch_kls.append((ratio - 1 - logratio).mean().item())
                 stats["losses/policy_loss"].append(policy_loss.item())
                 stats["losses/value_loss"].append(value_loss.item())
                 stats["losses/entropy"].append(entropy.item())
                 stats["losses/grad_norm"].append(grad_norm.item())
-                stats["losses/old_approx_kl"].append(-logratio.mean().item())
                 stats["losses/clipfrac"].append((ratio != clipped).float().mean().item())
-                stats["policy/alpha"].append(distribution.concentration1.mean().item())
-                stats["policy/beta"].append(distribution.concentration0.mean().item())
+                stats["policy/std"].append(distribution.stddev.mean().item())
             stats["losses/approx_kl"] += epoch_kls
-            mean_kl = average(torch.tensor(np.mean(epoch_kls), device=device))
-            if args.target_kl is not None and mean_kl > args.target_kl:
+            if average(torch.tensor(np.mean(epoch_kls), device=device)) > args.target_kl:
                 break
-        with torch.no_grad():
-            agent.actor[-1].bias += narrowing  # by schedule; the gradient moves it as well
+        with torch.no_grad():  # the policy narrows by schedule; the gradient moves it as well
+            agent.actor[-1].bias += args.narrowing / num_iterations
 
-        # Reports
-        now = time.time()
-        sps = world_size * batch_size / (now - rollout_start)
-        report = {"time/updates": iteration, "schedule/gamma": gamma}
-        report["schedule/perturbation"] = epsilon
-        report |= {name: np.mean(numbers) for name, numbers in stats.items()}
-        report |= crane_trials.rollout_report(envs, infos)
-        unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
-        report["losses/explained_variance"] = 1 - unexplained
-        at_bounds = (b_actions <= A_MIN) | (b_actions >= 1 - A_MIN)
-        report["policy/boundary_frac"] = at_bounds.float().mean().item()
-        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
-        report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
-        report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
-        stop = average(torch.tensor(float(len(run.stop_signals)), device=device)) > 0
-        run.finish_update(iteration, report, bool(stop))
+        # Log
+        global_step = iteration * world_size * batch_size
+        stats = {name: np.mean(values) for name, values in stats.items()}
+        stats |= trials.rollout_report(envs, infos)
+        explained = 1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
+        stats |= {"losses/explained_variance": explained, "schedule/gamma": gamma}
+        stats["schedule/perturbation"] = epsilon
+        stats["charts/learning_rate"] = left * args.learning_rate
+        stats["charts/SPS"] = world_size * batch_size / (time.perf_counter() - start)
+        runs.check_finite(iteration, stats, agent)
+        for name, value in stats.items() if rank == 0 else ():
+            writer.add_scalar(name, value, global_step)
+        bar.set_postfix(runs.shown(stats))
 
+        # Save
+        final = iteration == num_iterations
+        stopping = average(torch.tensor(float(bool(stop.received)), device=device)) > 0  # any rank
+        if rank == 0 and (iteration % 10 == 0 or final or stopping):
+            runs.save(folder, all_args, envs, agent, optimizer, iteration)
+        if stopping and rank > 0:
+            break
+        if stopping:
+            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
+
+        # Evaluate
+        if rank == 0 and (iteration % args.eval_every == 0 or final):
+            number = args.final_trials if final else args.eval_trials
+            scores = trials.evaluate(agent, args.env_id, number, **evaluation)
+            for name, score in scores.items():
+                writer.add_scalar(f"eval/{name}", score, global_step)
+            bar.write(f"{global_step:,} steps: " + runs.one_line(scores))
+    if rank == 0:
+        writer.close()
     dist.destroy_process_group()
-    run.finish()

@@ -16,85 +16,79 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
 Advantages A, returns R and the time limit are as in ppo_crane.py. A is scaled over the rollout.
-Difficulty, policy width, horizon and the critic's step size follow schedules (docs/mppo_beta.md).
+Difficulty, policy width, horizon and the critic's step size follow schedules (docs/training.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
-    python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64 --eval-every 200
+    python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
 """
 
 import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 # OpenMP workers spin briefly before they sleep: low latency, and two runs can share two cores.
 os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
-import gymnasium
 import numpy as np
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
 
-import crane_env
-import crane_options
-import crane_runs
-import crane_trials
-from crane_options import Count, Exponent, Factor, Range, Seed, Share, Size, Threads, Times, Width
-
-ALGORITHM = "trpo"
+from crane_env import STRICT, Options
+from crane_utils import runs, trials
+from crane_utils.runs import Count, Factor, Share
 
 
-@dataclass
+@dataclass(config=STRICT)
 class Args:
-    # experiment
+    # run
     exp_name: str = Path(__file__).stem  # part of the run's folder name
-    seed: Seed = 1  # seed of the networks, the policy's samples and the episodes
-    total_timesteps: Count = 1_024_000  # decisions of all cranes together, in whole rollouts
+    seed: Annotated[int, Field(ge=0)] = 1  # of the networks, the policy's samples and the episodes
+    total_timesteps: Count = 1_024_000  # steps of all cranes together, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
-    torch_threads: Annotated[int, Range(1, 256)] = 2  # CPU threads of an update
-    env_threads: Threads = 2  # CPU threads of the physics, 0 for all cores
+    threads: Count = 2  # CPU threads of physics and updates
+    eval_every: Count = 25  # updates between evaluations
+    eval_trials: Count = 20  # trials per log diameter in each evaluation
+    final_trials: Count = 100  # the same after the last update
     resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 
     # task
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
-    num_envs: Size = 64  # cranes simulated side by side
-    env: crane_options.Options = field(default_factory=lambda: {"retry": 0.0})
-    """options of the crane: those of the task, except retry; (task: x): that of ForestryCrane-v0"""
-    warm_up: Share = 0.4  # share of the run in which the crane's difficulty rises to its full value
+    num_envs: Count = 64  # cranes simulated side by side
+    env: Options = field(default_factory=Options)  # options of the task; its --help shows its own
 
     # algorithm
-    num_steps: Size = 64  # decisions per crane and rollout
-    hidden_sizes: tuple[Width, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    normalize_obs: bool = True  # scale observations by their running mean and std
+    num_steps: Count = 64  # steps per crane and rollout
+    hidden_sizes: tuple[Count, ...] = (256, 256)  # hidden layers of the actor and of the critic
     learning_rate: Factor = 1e-3  # Adam's step size at the start, for the critic
-    gamma: Share = 0.97  # discount per 0.1 s at the start
-    horizon_growth: Annotated[float, Range(1, 1000)] = 3.0  # 1 / (1 - gamma) grows by this factor
-    gae_lambda: Share = 0.95  # lambda of the advantage estimate, per 0.1 s
-    reward_scale: Factor = 0.06  # factor on the reward, per 0.1 s; falls as the horizon grows
-    minibatch_size: Count = 1024  # decisions per gradient step of the critic
-    update_epochs: Times = 8  # passes of the critic over each rollout
-    max_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
-    cg_iterations: Times = 15  # iterations of the conjugate gradient
+    gamma: Share = 0.97  # discount per step at the start
+    gae_lambda: Share = 0.95  # lambda of the advantage estimate, per step
+    reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
+    minibatch_size: Count = 1024  # steps per gradient step of the critic
+    update_epochs: Count = 8  # passes of the critic over each rollout
+    target_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
+    cg_iters: Count = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
-    fisher_samples: Count = 1024  # decisions of each rollout whose F gives the step's direction
-    line_search_steps: Times = 10  # largest number of trials of the line search
-    line_search_decay: Annotated[float, Range(0.01, 0.99)] = 0.8  # c, factor from trial to trial
+    fisher_samples: Count = 1024  # steps of each rollout whose F gives the step's direction
+    backtrack_iters: Count = 10  # largest number of trials of the line search
+    backtrack_coeff: Annotated[float, Field(gt=0, lt=1)] = 0.8  # c, factor from trial to trial
     max_grad_norm: Factor = 0.5  # bound of the norm of the critic's gradient
-    log_std_init: Exponent = -1.2  # log sigma at the start [action units]
-    narrowing: Exponent = 0.3  # fall of log sigma by schedule; the gradient moves it as well
+    log_std_init: float = -1.2  # log sigma at the start [action units]
 
-    # evaluation
-    eval_every: Annotated[int, Range(0, 10**10)] = 25  # updates between evaluations, 0 for none
-    eval_trials: Times = 20  # trials per log diameter in each evaluation
-    final_trials: Annotated[int, Range(0, 1000)] = 100  # the same after the training, 0 for none
-    eval_seed: Seed = 10_000  # seed of all trials
-
-    def __post_init__(self) -> None:
-        crane_options.check(vars(self), Args)
+    # schedules (docs/training.md)
+    curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
+    retry: Share = 0.0  # largest share of episodes that repeat a failed start
+    horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
+    narrowing: float = 0.3  # fall of log sigma in the run; the gradient moves it as well
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -103,12 +97,11 @@ def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
     return layer
 
 
-def mlp(inputs: int, hidden_sizes: tuple[int, ...], outputs: int, std: float) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for width in hidden_sizes:
-        layers += [layer_init(nn.Linear(inputs, width)), nn.Tanh()]
-        inputs = width
-    return nn.Sequential(*layers, layer_init(nn.Linear(inputs, outputs), std))
+def mlp(sizes: list[int], std: float) -> nn.Sequential:
+    layers = []
+    for inputs, outputs in pairwise(sizes[:-1]):
+        layers += [layer_init(nn.Linear(inputs, outputs)), nn.Tanh()]
+    return nn.Sequential(*layers, layer_init(nn.Linear(*sizes[-2:]), std))
 
 
 class Agent(nn.Module):
@@ -116,10 +109,9 @@ class Agent(nn.Module):
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
-        self.normalize_obs = args.normalize_obs
-        self.actor = mlp(obs_dim, args.hidden_sizes, len(action_low), std=0.01)
+        self.actor = mlp([obs_dim, *args.hidden_sizes, len(action_low)], std=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
-        self.critic = mlp(obs_dim, args.hidden_sizes, 1, std=1.0)
+        self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
         self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
         self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
@@ -137,14 +129,11 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std, clipped to +-10; obs itself without normalize_obs."""
-        if not self.normalize_obs:
-            return obs
+        """(obs - mean) / std, clipped to +-10."""
         scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
         return scaled.clamp(-10, 10)
 
     def get_value(self, obs: Tensor) -> Tensor:
-        """V(s), (B,)."""
         return self.critic(obs).squeeze(-1)
 
     def get_distribution(self, obs: Tensor) -> Normal:
@@ -160,9 +149,7 @@ class Agent(nn.Module):
         return actions.clamp(self.action_low, self.action_high).cpu().numpy()
 
     @torch.no_grad()
-    def predict(
-        self, obs: np.ndarray, state: None = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, None]:
+    def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
         """Actions (B, act_dim) for raw obs (B, obs_dim), and None: it has no memory."""
         obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
         distribution = self.get_distribution(self.normalize(obs))
@@ -194,10 +181,8 @@ def fisher_vector_product(agent: Agent, obs: Tensor, damping: float) -> Callable
     return product
 
 
-def conjugate_gradient(
-    matvec: Callable[[Tensor], Tensor], b: Tensor, iterations: int
-) -> tuple[Tensor, float]:
-    """Roughly x with matvec(x) = b, for a symmetric positive definite matrix; relative residual."""
+def conjugate_gradient(matvec: Callable[[Tensor], Tensor], b: Tensor, iterations: int) -> Tensor:
+    """Roughly x with matvec(x) = b, for a symmetric positive definite matrix."""
     x, residual = torch.zeros_like(b), b.clone()
     direction, residual_sq = b.clone(), b @ b
     for _ in range(iterations):
@@ -209,7 +194,7 @@ def conjugate_gradient(
         residual -= step * product
         direction = residual + (residual @ residual) / residual_sq * direction
         residual_sq = residual @ residual
-    return x, (residual_sq.sqrt() / (b.norm() + 1e-30)).item()
+    return x
 
 
 def surrogate_and_kl(
@@ -232,11 +217,11 @@ def line_search(
     """
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
     start = flat(agent.policy_parameters())
-    for k in range(args.line_search_steps):
-        fraction = args.line_search_decay**k
+    for k in range(args.backtrack_iters):
+        fraction = args.backtrack_coeff**k
         nn.utils.vector_to_parameters(start + fraction * full_step, agent.policy_parameters())
         surrogate, kl = surrogate_and_kl(agent, *batch)
-        if kl <= args.max_kl and surrogate > old_surrogate:
+        if kl <= args.target_kl and surrogate > old_surrogate:
             return fraction, kl.item(), (surrogate - old_surrogate).item()
     nn.utils.vector_to_parameters(start, agent.policy_parameters())
     return 0.0, 0.0, 0.0
@@ -245,11 +230,8 @@ def line_search(
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N) of rewards, values, dones (T, N). next_value (N,) is V after the last step.
-
-    dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]). No bootstrapping there.
-    Where the time limit cut it, the caller has already added gamma * V(final_obs) to the reward.
-    """
+    """Advantages (T, N). dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]), and
+    next_value (N,) is V after the last step."""
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
@@ -261,61 +243,52 @@ def compute_gae(
 
 
 if __name__ == "__main__":
-    args, checkpoint = crane_runs.read_arguments(ALGORITHM, Args, __doc__)
+    args, checkpoint = runs.parse(Args, __doc__)
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
-    if batch_size < 2:
-        raise SystemExit("--num-envs times --num-steps must be at least 2")
+    num_iterations = max(1, args.total_timesteps // batch_size)
 
     def to_tensor(x: np.ndarray) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float32, device=device)
 
+    def difficulty(iteration: int) -> float:  # easy starts first; 1 is the full task
+        return min(1.0, iteration / num_iterations / max(args.curriculum, 1e-9))
+
     # Environments
-    try:
-        envs = crane_trials.make_envs(args.env_id, args.num_envs, args.env_threads, **args.env)
-    except (gymnasium.error.Error, ImportError, crane_options.OptionError) as error:
-        raise SystemExit(f"{args.env_id}: {error}") from None
+    evaluation = {"threads": args.threads, "options": asdict(args.env)}
+    envs = trials.make_envs(args.env_id, args.num_envs, **evaluation, retry=args.retry)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    is_crane = isinstance(envs.unwrapped, crane_env.CraneVectorEnv)
-    full_difficulty = envs.unwrapped.difficulty if is_crane else 1.0
-    physics_steps = envs.unwrapped.frame_skip if is_crane else 1  # per decision
-    tenths = physics_steps / 20 if is_crane else 1.0  # length of a decision [0.1 s]; 1 elsewhere
 
     # Agent
     torch.manual_seed(args.seed)
-    torch.set_num_threads(args.torch_threads)  # the rounding of the weights depends on it
+    torch.set_num_threads(args.threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
-    weights = agent.critic.parameters()
-    optimizer = torch.optim.Adam(weights, lr=args.learning_rate, eps=1e-5, fused=True)
-    # With --resume it loads weights and optimizer. From here on Ctrl-C waits for the update.
-    run = crane_runs.Run(ALGORITHM, args, envs, agent, optimizer, checkpoint)
+    critic = agent.critic.parameters()
+    optimizer = torch.optim.Adam(critic, lr=args.learning_rate, eps=1e-5, fused=True)
+    first_iteration, env_seed = runs.restore(args, checkpoint, agent, optimizer)
 
-    def set_difficulty(iteration: int) -> None:
-        """Easy starts first: the difficulty rises to its full value in the warm-up."""
-        so_far = iteration / run.num_iterations
-        share = so_far / args.warm_up if so_far < args.warm_up else 1.0
-        if is_crane:
-            envs.unwrapped.difficulty = full_difficulty * share
+    folder, stop = runs.make_folder(args), runs.StopSignal()
+    writer = SummaryWriter(folder, purge_step=(first_iteration - 1) * batch_size + 1)
+    writer.add_text("hyperparameters", "\n".join(f"    {k}: {v}" for k, v in asdict(args).items()))
 
     # Storage
     obs = torch.zeros((args.num_steps, args.num_envs, obs_space.shape[0]), device=device)
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
-    set_difficulty(run.first_iteration)  # before the reset: it shapes the first starts
-    next_obs = to_tensor(envs.reset(seed=run.env_seed)[0])
-    for iteration in run.iterations():
+    envs.unwrapped.difficulty = difficulty(first_iteration)  # it shapes the first starts
+    next_obs = to_tensor(envs.reset(seed=env_seed)[0])
+    todo = range(first_iteration, num_iterations + 1)
+    for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
         # Schedules
-        progress = (iteration - 1.0) / run.num_iterations
-        left = 1.0 - progress
+        left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
-        gamma = (1 - (1 - args.gamma) / growth) ** tenths
-        reward_scale = args.reward_scale * tenths / growth  # V keeps its size as the horizon grows
-        narrowing = args.narrowing / run.num_iterations
-        set_difficulty(iteration)
+        gamma = 1 - (1 - args.gamma) / growth
+        reward_scale = args.reward_scale / growth  # V keeps its size as the horizon grows
+        envs.unwrapped.difficulty = difficulty(iteration)
 
         # Rollout
-        rollout_start = time.time()
+        start = time.perf_counter()
         torch.set_num_threads(1)  # the batches are too small for more
         infos = []
         for step in range(args.num_steps):
@@ -328,21 +301,21 @@ if __name__ == "__main__":
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = to_tensor(terminated | truncated)
             infos.append(info)
-            cut = truncated & ~terminated  # bootstrap: V stands for what the time limit cut off
-            if cut.any():
+            cut = truncated & ~terminated
+            if cut.any():  # bootstrap: V stands for what the time limit cut off
                 final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))
                 with torch.no_grad():
                     rewards[step, cut] += gamma * agent.get_value(final_obs)
 
-        # Advantages
-        update_start = time.time()
-        torch.set_num_threads(args.torch_threads)
+        # Advantages. The policy was frozen in the rollout: values and log-probabilities of all its
+        # steps come in one batch here, and not one by one in the loop above.
+        torch.set_num_threads(args.threads)
         b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
         with torch.no_grad():
             values = agent.get_value(b_obs).view_as(rewards)
             old = agent.get_distribution(b_obs)
             next_value = agent.get_value(agent.normalize(next_obs))
-        advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda**tenths)
+        advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda)
         b_advantages, b_returns = advantages.flatten(), (advantages + values).flatten()
 
         # Policy update: one step
@@ -353,24 +326,19 @@ if __name__ == "__main__":
         # F of a sample gives a good direction, but a length with which KL exceeds delta.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
         matvec = fisher_vector_product(agent, b_obs[sample], args.cg_damping)
-        direction, cg_residual = conjugate_gradient(matvec, gradient, args.cg_iterations)
+        direction = conjugate_gradient(matvec, gradient, args.cg_iters)
         curvature = direction @ fisher_vector_product(agent, b_obs, args.cg_damping)(direction)
-        full_step = torch.sqrt(2 * args.max_kl / (curvature + 1e-12)) * direction
+        full_step = torch.sqrt(2 * args.target_kl / (curvature + 1e-12)) * direction
         fraction, kl, improvement = line_search(agent, full_step, batch, args)
-        step_report = {
-            "losses/policy_loss": -(surrogate.item() + improvement),
-            "losses/entropy": old.entropy().sum(-1).mean().item(),
-            "policy/std": agent.log_std.exp().mean().item(),
-            "trpo/kl": kl,
-            "trpo/step_fraction": fraction,
-            "trpo/line_search_ok": float(fraction > 0),
-            "trpo/cg_residual": cg_residual,
-            "trpo/expected_improvement": (fraction * gradient @ full_step).item(),
-            "trpo/improvement": improvement,
-        }
+        stats = defaultdict(list)
+        stats["losses/policy_loss"].append(-(surrogate.item() + improvement))
+        stats["losses/entropy"].append(old.entropy().sum(-1).mean().item())
+        stats["losses/approx_kl"].append(kl)
+        stats["policy/std"].append(old.stddev.mean().item())
+        stats["trpo/step_fraction"].append(fraction)
+        stats["trpo/improvement"].append(improvement)
 
         # Critic update
-        stats = defaultdict(list)
         for _ in range(args.update_epochs):
             for mb in torch.randperm(batch_size, device=device).split(args.minibatch_size):
                 value_loss = ((agent.get_value(b_obs[mb]) - b_returns[mb]) ** 2).mean()
@@ -380,20 +348,34 @@ if __name__ == "__main__":
                 optimizer.step()
                 stats["losses/value_loss"].append(value_loss.item())
                 stats["losses/grad_norm"].append(grad_norm.item())
-        with torch.no_grad():
-            agent.log_std -= narrowing  # by schedule; the gradient moves it as well
+        with torch.no_grad():  # the policy narrows by schedule; the gradient moves it as well
+            agent.log_std -= args.narrowing / num_iterations
 
-        # Reports
-        now = time.time()
-        sps = batch_size / (now - rollout_start)
-        report = {"time/updates": iteration, "schedule/gamma": gamma} | step_report
-        report |= {name: np.mean(numbers) for name, numbers in stats.items()}
-        report |= crane_trials.rollout_report(envs, infos)
-        unexplained = (b_advantages.var() / (b_returns.var() + 1e-8)).item()
-        report["losses/explained_variance"] = 1 - unexplained
-        report["schedule/learning_rate"] = optimizer.param_groups[0]["lr"]
-        report |= {"time/SPS": sps, "time/simulation_SPS": sps * physics_steps}
-        report |= {"time/rollout": update_start - rollout_start, "time/update": now - update_start}
-        run.finish_update(iteration, report)
+        # Log
+        global_step = iteration * batch_size
+        stats = {name: np.mean(values) for name, values in stats.items()}
+        stats |= trials.rollout_report(envs, infos)
+        explained = 1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
+        stats |= {"losses/explained_variance": explained, "schedule/gamma": gamma}
+        stats["charts/learning_rate"] = left * args.learning_rate
+        stats["charts/SPS"] = batch_size / (time.perf_counter() - start)
+        runs.check_finite(iteration, stats, agent)
+        for name, value in stats.items():
+            writer.add_scalar(name, value, global_step)
+        bar.set_postfix(runs.shown(stats))
 
-    run.finish()
+        # Save
+        final = iteration == num_iterations
+        if iteration % 10 == 0 or final or stop.received:
+            runs.save(folder, args, envs, agent, optimizer, iteration)
+        if stop.received:
+            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
+
+        # Evaluate
+        if iteration % args.eval_every == 0 or final:
+            number = args.final_trials if final else args.eval_trials
+            scores = trials.evaluate(agent, args.env_id, number, **evaluation)
+            for name, score in scores.items():
+                writer.add_scalar(f"eval/{name}", score, global_step)
+            bar.write(f"{global_step:,} steps: " + runs.one_line(scores))
+    writer.close()

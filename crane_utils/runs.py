@@ -1,0 +1,187 @@
+"""A training run: its arguments, its folder, stop signals, and the policy that it leaves behind.
+
+This module has no learning, and a run's folder has four files: TensorBoard's events, policy.pt to
+act with, checkpoint.pt to resume from, and a copy of the script that wrote them.
+"""
+
+import argparse
+import importlib.util
+import os
+import shutil
+import signal
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import VectorEnv
+from pydantic import Field
+from torch import nn
+from torch.optim import Optimizer
+
+from crane_env import Options
+from crane_utils import trials
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Factor = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
+    """The script's `Args` from the command line and, with --resume, the run's checkpoint.
+
+    The defaults of --env.* are those of the task that --env-id names, or of the resumed run.
+    """
+    sys.path.insert(0, os.getcwd())  # where the user's own tasks are
+    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    scan.add_argument("--env-id", "--env_id", default=arguments.env_id)
+    scan.add_argument("--resume", type=Path)
+    seen, _ = scan.parse_known_args()
+    checkpoint = None
+    if seen.resume:
+        checkpoint = load(seen.resume / "checkpoint.pt")
+        if checkpoint["script"] != (script := Path(sys.argv[0]).name):
+            raise SystemExit(f"--resume: {checkpoint['script']} wrote {seen.resume}, not {script}")
+        default = restore_args(arguments, checkpoint)
+    else:
+        default = arguments(env_id=seen.env_id, env=trials.task_options(seen.env_id) or Options())
+    args = tyro.cli(arguments, default=default, description=description.partition("\n\n")[0])
+    if not trials.crane_class(args.env_id) and args.env != Options():
+        raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
+    return args, checkpoint
+
+
+def restore_args(arguments: type, saved: dict[str, Any]) -> Any:
+    """`Args` as they were saved, for the same script or an edited one with more of them."""
+    cranes = trials.crane_class(saved["task"]["env_id"])
+    options = (cranes.Options if cranes else Options)(**saved["args"]["env"])
+    return arguments(**{**saved["args"], "env": options})
+
+
+def restore(
+    args: Any, checkpoint: dict | None, agent: nn.Module, optimizer: Optimizer
+) -> tuple[int, int]:
+    """Load a checkpoint, if any. Returns the first update to make, and the seed of its episodes.
+
+    A resumed run draws new episodes and samples.
+    """
+    first_iteration = checkpoint["iteration"] + 1 if checkpoint else 1
+    env_seed = np.random.SeedSequence((args.seed, first_iteration)).generate_state(1)[0].item()
+    if checkpoint:
+        agent.load_state_dict(checkpoint["weights"])
+        optimizer.load_state_dict(checkpoint["optimizer"])
+        torch.manual_seed(env_seed)
+    return first_iteration, env_seed
+
+
+def make_folder(args: Any) -> Path:
+    """The run's folder: that of --resume, or a new one with a copy of the script."""
+    if args.resume:
+        return args.resume
+    name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    name = name.replace("/", "-").replace(":", "-")
+    for number in range(1, 1000):
+        folder = Path("runs", name if number == 1 else f"{name}_{number}")
+        try:
+            folder.mkdir(parents=True)  # two runs that start together get two folders
+            break
+        except FileExistsError:
+            continue
+    shutil.copy(sys.argv[0], folder)
+    print(f"writing to {folder}", flush=True)
+    return folder
+
+
+def save(
+    folder: Path, args: Any, envs: VectorEnv, agent: nn.Module, optimizer: Optimizer, iteration: int
+) -> None:
+    """Write policy.pt, to act with, and checkpoint.pt, to resume from."""
+    weights, crane = agent.state_dict(), envs.unwrapped
+    run = {"script": Path(sys.argv[0]).name, "args": asdict(args) | {"resume": None}}
+    run["task"] = {"env_id": args.env_id, **getattr(crane, "task", {})}
+    acting = {name: w for name, w in weights.items() if not name.startswith("critic.")}
+    resuming = {"optimizer": optimizer.state_dict(), "iteration": iteration}
+    write(folder / "policy.pt", run | {"weights": acting})
+    write(folder / "checkpoint.pt", run | {"weights": weights} | resuming)
+
+
+def write(path: Path, contents: dict[str, Any]) -> None:
+    """Write a file whole or not at all: a kill or a full disk leaves the old one."""
+    unfinished = path.with_suffix(".unfinished")
+    torch.save(contents, unfinished)
+    os.replace(unfinished, path)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """What `write` wrote: numbers, strings and tensors, no code."""
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+class StopSignal:
+    """Ctrl-C, kill or a closed terminal sets `received`. A second Ctrl-C stops at once."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP, and nohup ignores it
+            if number and signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self.receive)
+
+    def receive(self, number: int, frame: FrameType | None) -> None:
+        self.received = number
+        if number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def shown(stats: dict[str, float]) -> dict[str, str]:
+    """What stands beside the progress bar."""
+    names = {"return": "episodic_return", "success": "success_rate", "SPS": "SPS"}
+    found = {short: stats.get(f"charts/{name}") for short, name in names.items()}
+    return {short: f"{value:.3g}" for short, value in found.items() if value is not None}
+
+
+def one_line(scores: dict[str, float]) -> str:
+    """What an evaluation prints."""
+    return ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
+
+
+def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> None:
+    """SystemExit that names what is not finite after an update."""
+    wrong = [name for name, value in stats.items() if value != value or abs(value) == float("inf")]
+    wrong += [name for name, weights in agent.state_dict().items() if not weights.isfinite().all()]
+    if wrong:
+        raise SystemExit(
+            f"update {iteration}: {', '.join(wrong[:3])} not finite. Lower --learning-rate (TRPO: "
+            "--target-kl) or look at the task's rewards."
+        )
+
+
+def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
+    """The agent in a run's folder or policy.pt, its task, and the name of its script.
+
+    The agent is built by the copy of the script beside policy.pt, which is code that runs, or by
+    the script of that name in this repository. The task has `env_id`, and of a crane `revision` and
+    `options`.
+    """
+    path = path / "policy.pt" if path.is_dir() else path
+    saved = load(path)
+    script = path.parent / saved["script"]
+    if not script.is_file():
+        script = Path(__file__).parents[1] / saved["script"]
+    if not script.is_file():
+        raise SystemExit(f"{path} needs {saved['script']}, whose Agent it holds, beside it")
+    spec = importlib.util.spec_from_file_location(script.stem, script)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[script.stem] = module  # where dataclasses look for it
+    spec.loader.exec_module(module)
+    weights = saved["weights"]
+    bounds = weights["action_low"].numpy(), weights["action_high"].numpy()
+    agent = module.Agent(len(weights["obs_mean"]), *bounds, restore_args(module.Args, saved))
+    # policy.pt has no critic, and acting needs none
+    agent.load_state_dict(agent.critic.state_dict(prefix="critic.") | weights)
+    return agent, saved["task"], script.name

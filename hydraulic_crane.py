@@ -1,0 +1,291 @@
+"""Beyond the paper: the crane with hydraulic drives that imitate measurements, and randomization.
+
+    import gymnasium
+    envs = gymnasium.make_vec("crane_env:ForestryCraneHydraulic-v0", num_envs=64)
+
+The task is that of crane_env.py. This file overrides its hooks and needs nothing else: it is also
+the example of a task of one's own. A commanded speed passes the lag of a valve, the limit of the
+pump and a dead time. The resulting speed moves the rest position of a spring. The force of the
+spring is limited and drives a damped joint. In `ForestryCraneRandomized-v0` each episode draws
+drives, a log, friction and sensor errors. Sources of all numbers: assets/README.md.
+
+With `sensors` the observation has 32 numbers, what the machine measures:
+
+| index  | meaning                                                        | unit  | low, high |
+|--------|----------------------------------------------------------------|-------|-----------|
+| 0-17   | those of crane_env.py                                          |       |           |
+| 18-23  | last command of q1, q2, q3, q4, q7, q8, fraction of its limit  | 1     | -1, 1     |
+| 24-25  | velocities of q5, q6                                           | rad/s | -10, 10   |
+| 26-31  | force of the oil on q1, q2, q3, q4, q7, q8, fraction of limit  | 1     | -1, 1     |
+"""
+
+from typing import Annotated, Any
+
+import mujoco
+import numpy as np
+from numpy import ndarray as Array
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+import crane_env
+from crane_env import (
+    ACTION_OF_SERVO,
+    JAW_LENGTH,
+    JOINTS,
+    PIVOT_HEIGHT,
+    SERVOS,
+    STRICT,
+    CraneState,
+    centred,
+    speed_limit,
+)
+
+# ---- the drives; six numbers belong to q1, q2, q3, each telescope stage, q7 and q8
+
+STIFFNESS = np.array([2.19e5, 1.50e6, 1.73e6, 1.40e5, 1.23e4, 2.5e4])  # N m/rad, N/m
+DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 3.4e3])  # N m s/rad, N s/m
+LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.130])  # s, of the valve, first order
+DEAD_TIME = np.array([0.117, 0.080, 0.044, 0.060, 0.058, 0.058])  # s
+BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
+MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
+PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
+MIN_LEVER = 0.05  # m; below q2 = -1.13 rad the boom's computed lever is smaller or negative
+# Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
+# The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
+OIL = np.array(
+    [[12.724e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
+     [12.724e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
+)  # fmt: skip
+FIRST_SERVO = [0, 1, 2, 3, 5, 6]  # of each command: the first telescope stage, the outer jaw
+PASSIVE = [4, 5]  # of our q1 ... q8
+
+# What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
+# damping are wide, so their logarithms are uniform. All else is uniform.
+DRAWN = {
+    "stiffness": (
+        STIFFNESS,
+        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4]),
+        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),
+    ),
+    "damping": (
+        DAMPING,
+        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 2.7e3]),
+        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 4.3e3]),
+    ),
+    "extra_delay": (0.0, -0.02, 0.02),  # s, added to the dead time of all joints
+    "gain": (  # factor on the speed, in the negative and the positive direction
+        np.ones((2, 6)),
+        np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
+        np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
+    ),
+    "density": (crane_env.LOG_DENSITY, 450.0, 950.0),  # kg/m^3
+    "friction": (1.0, 0.5, 1.5),  # factor on that of all surfaces
+    "pose_error": (np.zeros(3), np.full(3, -0.057), np.full(3, 0.057)),  # m, 0.1 m at most
+    "yaw_error": (0.0, -0.1745, 0.1745),  # rad
+    "joint_error": (np.zeros(8), -0.0087 * (np.arange(8) != 3), 0.0087 * (np.arange(8) != 3)),
+    "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
+}
+
+# ---- the reward, where soft drives need another one
+
+EMPTY_GRIP = 0.5  # share of r_grapple for closed jaws without a log; a grip earns all
+
+
+@dataclass(config=STRICT)
+class Options(crane_env.Options):
+    """Options of the hydraulic crane."""
+
+    randomize: Annotated[float, Field(ge=0, le=1)] = 0.0  # width of what each episode draws
+    sensors: bool = True  # also observe last command, rates of q5 and q6, oil forces
+
+
+def cylinder_levers(q2: Array, q3: Array) -> Array:
+    """Metres that boom and arm cylinder lengthen per radian of q2 and q3, (2, N).
+
+    The arm's cylinder pushes the arm itself. The boom's pushes the joint of two bars, 0.57 m to
+    the column and 0.124 m to the boom.
+    """
+
+    def boom(q: Array) -> Array:
+        q = np.maximum(q, -1.18)  # lower, the bars do not reach each other
+        x, y = 0.4539 * np.cos(q) + 0.036 * np.sin(q) + 0.12, 0.4539 * np.sin(q) - 0.036 * np.cos(q)
+        y = y + 0.07  # from the bars' pivot on the column to that on the boom
+        apart = np.hypot(x, y)
+        along = (0.57**2 - 0.124**2 + apart**2) / (2 * apart)
+        across = np.sqrt(np.maximum(0.57**2 - along**2, 0))
+        foot_x, foot_y = 0.553, -1.6982  # of the cylinder, from the same pivot
+        knee_x, knee_y = (along * x + across * y) / apart, (along * y - across * x) / apart
+        return np.hypot(knee_x - foot_x, knee_y - foot_y)
+
+    def arm(q: Array) -> Array:
+        x, y = -0.118 * np.cos(q) + 0.468 * np.sin(q), -0.118 * np.sin(q) - 0.468 * np.cos(q)
+        return np.hypot(x + 1.6802, y + 0.0485)
+
+    step = 1e-4
+    levers = [(f(q + step) - f(q - step)) / (2 * step) for f, q in ((boom, q2), (arm, q3))]
+    return np.maximum(levers, MIN_LEVER)
+
+
+def oil_per_movement(q: Array, dq: Array) -> Array:
+    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6)."""
+    oil = np.where(dq < 0, OIL[0], OIL[1])
+    oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+    return oil
+
+
+def grip_depth(state: CraneState) -> Array:
+    """How far the tips of hanging jaws are below the log's centre, in radii of the log, (N,).
+
+    Jaws that pinch a log above its centre squeeze it out.
+    """
+    tips = state.grapple_centre[:, 2] + PIVOT_HEIGHT - JAW_LENGTH * np.sin(state.q[:, 7])
+    return (state.log_centre[:, 2] - tips) / (state.diameter / 2)
+
+
+class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
+    """N cranes with hydraulic drives. With randomize, `info` says in `drawn_...` what was drawn."""
+
+    Options = Options
+    REVISION = 8
+    PIECE = 4  # physics steps between two looks of the valves at the command, 20 ms
+    GROUND_WEIGHT, GROUND_MOST = 90.0, 3.0
+
+    def __init__(self, num_envs: int = 1, **kwargs: Any):
+        super().__init__(num_envs, **kwargs)
+        names = ("actuator_gainprm", "actuator_biasprm", "actuator_delay", "dof_damping")
+        self.engine = {name: self.batch.expand(name) for name in (*names, "geom_friction")}
+        self.drawn = {
+            name: np.tile(nominal, (num_envs, *[1] * np.ndim(nominal)))
+            for name, (nominal, _, _) in DRAWN.items()
+        }
+        self.valve_speed = np.zeros((num_envs, 6))  # rad/s, m/s, that the valves let through
+        self.telescope_wait = np.zeros(num_envs)  # s since a resting telescope was commanded
+
+    # ---- the model and the start of an episode
+
+    def make_spec(self) -> mujoco.MjSpec:
+        """The crane's servos become drives."""
+        spec = super().make_spec()
+        for index, action in zip(SERVOS, ACTION_OF_SERVO):
+            joint = spec.joints[index]
+            joint.damping[0] = DAMPING[action]
+            spec.actuator(joint.name).gainprm[0] = spec.actuator(joint.name).biasprm[2] = 0
+            spring = spec.actuator(f"{joint.name}_integral")
+            spring.gainprm[0], spring.biasprm[1] = STIFFNESS[action], -STIFFNESS[action]
+            spring.delay, spring.nsample = DEAD_TIME[action], MAX_DELAY
+        return spec
+
+    def draw_episode(self, i: int) -> tuple[Array, Array, float]:
+        """Also draw the machine, the log's density and the sensors' errors, as DRAWN says."""
+        q, log_pose, diameter = super().draw_episode(i)
+        if self.options.randomize:
+            *_, rng = self.rngs[i]
+            for name, (nominal, low, high) in DRAWN.items():
+                if name in ("stiffness", "damping"):
+                    drawn = np.exp(rng.uniform(np.log(low), np.log(high)))
+                else:
+                    drawn = rng.uniform(low, high)
+                self.drawn[name][i] = nominal + self.options.randomize * (drawn - nominal)
+        swing = np.zeros(8)
+        swing[PASSIVE] = self.drawn["swing"][i]
+        return q + swing, log_pose, diameter
+
+    def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
+        """Valves start as in a crane at rest."""
+        self.valve_speed[ids] = self.telescope_wait[ids] = 0
+        super().place(ids, q, log_pose, diameter)
+
+    def set_constants(self, ids: Array, radius: Array) -> None:
+        """Also give the engine what was drawn."""
+        drawn = {name: values[ids] for name, values in self.drawn.items()}
+        self.density[ids] = drawn["density"]
+        super().set_constants(ids, radius)
+        stiffness = drawn["stiffness"][:, ACTION_OF_SERVO]
+        self.servo_kp[ids] = stiffness
+        self.max_lead[ids] = self.model.jnt_actfrcrange[SERVOS, 1] / stiffness
+        self.engine["actuator_gainprm"][ids, 8:, 0] = stiffness
+        self.engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
+        self.engine["dof_damping"][np.ix_(ids, SERVOS)] = drawn["damping"][:, ACTION_OF_SERVO]
+        delay = self.model.actuator_delay[8:] + drawn["extra_delay"][:, None]
+        self.engine["actuator_delay"][ids, 8:] = delay
+        friction = self.model.geom_friction * drawn["friction"][:, None, None]
+        self.engine["geom_friction"][ids] = friction
+
+    # ---- what moves the joints
+
+    def drive(self, ids: Array, seconds: float) -> None:
+        """The mean speed that valves and pump give in the next seconds moves the springs."""
+        command, gain = self.command[ids], self.drawn["gain"][ids]
+        command = np.where(command < 0, gain[:, 0], gain[:, 1]) * command
+        self.ctrl[ids, 8:] = self.oil_speed(ids, command, seconds)[:, ACTION_OF_SERVO]
+
+    def oil_speed(self, ids: Array, command: Array, seconds: float) -> Array:
+        """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
+
+        A valve follows its command (n, 6) as a first-order lag. A resting telescope's load-holding
+        valve opens late. If the joints together ask for more oil than the pump gives, each gets the
+        same share of what it asks for.
+        """
+        speed, telescope = self.valve_speed[ids], command[:, 3]
+        resting = (np.abs(speed[:, 3]) < 1e-3) & (np.abs(telescope) >= 1e-3)
+        self.telescope_wait[ids] = np.where(resting, self.telescope_wait[ids] + seconds, 0.0)
+        closed = resting & (self.telescope_wait[ids] <= BREAKAWAY)
+        target = command.copy()
+        target[closed, 3] = 0.0
+        decay = np.exp(-seconds / LAG)
+        mean = target + (speed - target) * LAG / seconds * (1 - decay)
+        self.valve_speed[ids] = target + (speed - target) * decay
+        oil = oil_per_movement(self.qpos[ids], mean)
+        demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
+        return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
+
+    # ---- what is observed, measured and rewarded
+
+    def observation_limits(self) -> Array:
+        limits = super().observation_limits()
+        if not self.options.sensors:
+            return limits
+        bound = np.repeat([1.0, 10.0, 1.0], [6, 2, 6])
+        return np.concatenate([limits, [-bound, bound]], axis=-1)
+
+    def observe(self, state: CraneState) -> Array:
+        """The observation of the state that faulty sensors report, and more sensors."""
+        x, y, z = state.log_axis.T
+        cos, sin = np.cos(self.drawn["yaw_error"]), np.sin(self.drawn["yaw_error"])
+        reported = state._replace(
+            q=state.q + self.drawn["joint_error"],
+            log_centre=state.log_centre + self.drawn["pose_error"],
+            log_axis=np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1),
+        )
+        obs = super().observe(reported)
+        if not self.options.sensors:
+            return obs
+        last_command = self.command / speed_limit(self.command)
+        rates = self.qvel[:, JOINTS][:, PASSIVE]
+        force = self.servo_kp * (self.act - self.qpos[:, SERVOS])
+        force = np.clip(force / self.model.jnt_actfrcrange[SERVOS, 1], -1, 1)[:, FIRST_SERVO]
+        return np.concatenate([obs, last_command, rates, force], axis=-1)
+
+    def measure(self, state: CraneState) -> dict[str, Array]:
+        info = super().measure(state)
+        if self.options.randomize:
+            info |= {f"drawn_{name}": values.copy() for name, values in self.drawn.items()}
+        return info
+
+    def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
+        """Soft drives lose what stiff servos hold.
+
+        So empty jaws earn at most half of r_grapple and a grip earns all. A grip lifts in full
+        where the tips are half a radius or more below the log's centre, and not at all where they
+        are half a radius above it.
+        """
+        closed, grip = super().grasp(state, miss)
+        held = state.touching.all(axis=-1)
+        closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
+        return closed, centred(miss) * np.clip(0.5 + grip_depth(state), 0, 1)
+
+
+class HydraulicCraneEnv(crane_env.CraneEnv):
+    """One hydraulic crane."""
+
+    cranes = HydraulicCraneVectorEnv
