@@ -307,15 +307,15 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     Crane i's starts depend on the seed, on i and, with retry, on how its episodes ended. They do
     not depend on N or on the threads.
 
-    `info` describes the step just made, for every crane, also one whose episode just ended:
-    the reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass` (kg),
-    `time_to_reach` (s, inf before), `ground_peak` (N, largest force of the crane on the ground in
-    this episode), `safe` (whether all `conditions` have held for HOLD_TIME) and `termination`: the
-    rule that ended the episode, "time_limit" or "none". Where an episode ended, there are `success`
-    (for Stable-Baselines3 `is_success`), `gentle` (success with at most GENTLE_FORCE on the ground)
-    and `failure`: the rule or the first of `conditions` that failed. The mask `_key` says for which
-    cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an episode, because the
-    observation is that of the next start (SAME_STEP autoreset).
+    `info` describes the step just made, for every crane, also one whose episode just ended: the
+    reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass`
+    (kg), `time_to_reach` (s, inf before), `ground_peak` (N, largest force of the crane on the
+    ground in this episode), `safe` (all `conditions` have held for HOLD_TIME) and `termination`:
+    the rule that ended the episode, "time_limit" or "none". Where an episode ended, there are
+    `success` (for Stable-Baselines3 `is_success`), `gentle` (success with at most GENTLE_FORCE on
+    the ground) and `failure`: the rule or the first of `conditions` that failed. The mask `_key`
+    says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an
+    episode, because the observation is that of the next start (SAME_STEP autoreset).
 
     `difficulty` in [0, 1] eases the starts (1 is the full task), `retry` in [0, 1] is the largest
     share of episodes that repeat a failed start. Both may be set at any time. `observers` are
@@ -462,8 +462,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         failure = np.select([~ok for ok in held.values()], [*held], default="")
         failure = np.where(terminated, ending, failure)
         failure[~done | success] = ""
-        info["termination"] = ending
         info |= {"success": success, "is_success": success, "gentle": gentle, "failure": failure}
+        info["termination"] = ending
         for i in np.flatnonzero(done):
             self.recent_success[i].append(bool(success[i]))
             if not success[i]:
@@ -489,7 +489,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self.rngs is None:
-            if seed is None or isinstance(seed, (int, np.integer)):
+            if seed is None or np.ndim(seed) == 0:
                 seed = SeedSequence(seed).spawn(self.num_envs)
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
@@ -501,8 +501,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
             self.recent_success = [deque(maxlen=10) for _ in seeds]  # a crane's last episodes
         self.start_episodes(np.arange(self.num_envs))
-        if self.render_mode == "human":
-            self.render()
         state = self.state()
         info = self.measure(state)
         everywhere = np.ones(self.num_envs, bool)
@@ -532,9 +530,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def start_episodes(self, ids: Array) -> None:
         """New episodes in cranes `ids`."""
-        q, log_pose, diameter = (
-            np.array(part) for part in zip(*[self.draw_episode(i) for i in ids])
-        )
+        starts = [self.draw_episode(i) for i in ids]
+        q, log_pose, diameter = map(np.array, zip(*starts))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
@@ -724,23 +721,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[Array, ...] | None:
         """RGB frames (height, width, 3), uint8, one a crane; "human" shows crane 0 in a window."""
-        if self.render_mode is None:
-            return None
-        if self.viewer is None:
+        if self.render_mode is not None and self.viewer is None:
             self.scene = self.batch.get_model(0), self.batch.get_data(0)
             if self.render_mode == "human":
-                import mujoco.viewer
+                from mujoco.viewer import launch_passive  # needs a display
 
-                self.viewer = mujoco.viewer.launch_passive(*self.scene)
+                self.viewer = launch_passive(*self.scene)
             else:
                 self.viewer = mujoco.Renderer(self.scene[0], *self.frame_size)
+        if self.render_mode == "rgb_array":
+            return tuple(self.picture(i, self.camera) for i in range(self.num_envs))
         if self.render_mode == "human":
             with self.viewer.lock():
                 self.batch.get_model(0, self.scene[0])
                 self.batch.get_data(0, self.scene[1])
             self.viewer.sync()
-            return None
-        return tuple(self.picture(i, self.camera) for i in range(self.num_envs))
 
     def picture(self, i: int, camera: str) -> Array:
         """What a camera sees of crane i, (height, width, 3), uint8."""
@@ -802,6 +797,5 @@ gymnasium.register("ForestryCranePaper-v0", ONE, vector_entry_point=MANY, kwargs
 # beyond the paper: hydraulic_crane.py
 ONE, MANY = "hydraulic_crane:HydraulicCraneEnv", "hydraulic_crane:HydraulicCraneVectorEnv"
 gymnasium.register("ForestryCraneHydraulic-v0", ONE, vector_entry_point=MANY)
-gymnasium.register(
-    "ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs={"randomize": 1.0}
-)
+DRAWN = {"randomize": 1.0}
+gymnasium.register("ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs=DRAWN)

@@ -133,7 +133,8 @@ def task_of(policy: Any, trained: dict, args: Args, flags: list[str]) -> tuple[s
     default = trials.task_options(env_id)
     if "options" in trained and not args.env_id:
         default = cranes.Options(**trained["options"])
-    options = tyro.cli(TaskArgs, args=flags, default=TaskArgs(env=default)).env
+    config = (tyro.conf.FlagConversionOff,)
+    options = tyro.cli(TaskArgs, args=flags, default=TaskArgs(env=default), config=config).env
     differs = {
         name: f"{value!r}, not {getattr(options, name, None)!r}"
         for name, value in trained.get("options", {}).items()

@@ -67,7 +67,7 @@ class Args:
     # task
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
-    env: Options = field(default_factory=Options)  # options of the task; its --help shows its own
+    env: Options = field(default_factory=Options)  # options of the task that --env-id names
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -115,15 +115,15 @@ class Agent(nn.Module):
         self.actor = mlp([obs_dim, *args.hidden_sizes, 2 * len(action_low)], std=0.01)
         nn.init.constant_(self.actor[-1].bias, args.log_excess_init)
         self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
-        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
+        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float64))
+        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float64))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
-        self.register_buffer("obs_count", torch.tensor(1e-4, dtype=torch.float64))
+        self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
 
     def update_normalizer(self, obs: Tensor) -> None:
-        """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
-        obs, new = obs.double(), len(obs)
+        """Merge mean and variance of obs (N, obs_dim), float64, into the running ones (Chan)."""
+        new = len(obs)
         count = self.obs_count + new
         delta = obs.mean(0) - self.obs_mean
         spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * new
@@ -132,9 +132,8 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std, clipped to +-10."""
-        scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
-        return scaled.clamp(-10, 10)
+        """(obs - mean) / std of obs in float64, as float32, clipped to +-10."""
+        return ((obs - self.obs_mean) / torch.sqrt(self.obs_var + 1e-8)).float().clamp(-10, 10)
 
     def get_value(self, obs: Tensor) -> Tensor:
         return self.critic(obs).squeeze(-1)
@@ -147,12 +146,12 @@ class Agent(nn.Module):
 
     def to_env(self, actions: Tensor) -> np.ndarray:
         """Actions in the environment's units, from a_n."""
-        return (self.action_low + (self.action_high - self.action_low) * actions).cpu().numpy()
+        return torch.lerp(self.action_low, self.action_high, actions.double()).cpu().numpy()
 
     @torch.no_grad()
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
         """Actions (B, act_dim) for raw obs (B, obs_dim), and None: it has no memory."""
-        obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
+        obs = torch.as_tensor(obs, dtype=torch.float64, device=self.obs_mean.device)
         distribution = self.get_distribution(self.normalize(obs))
         return self.to_env(distribution.mean if deterministic else distribution.sample()), None
 
@@ -160,8 +159,7 @@ class Agent(nn.Module):
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N). dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]), and
-    next_value (N,) is V after the last step."""
+    """Advantages (T, N). dones[t] says that step t ended an episode (in CleanRL: dones[t + 1])."""
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
@@ -178,8 +176,8 @@ if __name__ == "__main__":
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
 
-    def to_tensor(x: np.ndarray) -> Tensor:
-        return torch.as_tensor(x, dtype=torch.float32, device=device)
+    def to_tensor(x: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.as_tensor(x, dtype=dtype, device=device)
 
     def difficulty(iteration: int) -> float:  # easy starts first; 1 is the full task
         return min(1.0, iteration / num_iterations / max(args.curriculum, 1e-9))
@@ -188,7 +186,8 @@ if __name__ == "__main__":
     evaluation = {"threads": args.threads, "options": asdict(args.env)}
     envs = trials.make_envs(args.env_id, args.num_envs, **evaluation, retry=args.retry)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    assert action_space.is_bounded(), f"a Beta policy needs bounds, and {action_space} has none"
+    if not np.all(action_space.high - action_space.low < 1e9):
+        raise SystemExit(f"a Beta policy needs bounded actions, and {args.env_id} has none")
 
     # Agent
     torch.manual_seed(args.seed)
@@ -206,7 +205,7 @@ if __name__ == "__main__":
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones = torch.zeros((2, args.num_steps, args.num_envs), device=device)
     envs.unwrapped.difficulty = difficulty(first_iteration)  # it shapes the first starts
-    next_obs = to_tensor(envs.reset(seed=env_seed)[0])
+    next_obs = to_tensor(envs.reset(seed=env_seed)[0], torch.float64)
     todo = range(first_iteration, num_iterations + 1)
     for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
         # Schedules
@@ -231,15 +230,15 @@ if __name__ == "__main__":
             noise = epsilon * torch.empty_like(action).uniform_(-1, 1)  # Eq. (robust ppo)
             actions[step] = (action + noise).clamp(A_MIN, 1 - A_MIN)
             next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
-            next_obs = to_tensor(next_obs)
+            next_obs = to_tensor(next_obs, torch.float64)
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = to_tensor(terminated | truncated)
             infos.append(info)
             cut = truncated & ~terminated
             if cut.any():  # bootstrap: V stands for what the time limit cut off
-                final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))
+                final_obs = to_tensor(np.stack(info["final_obs"][cut]), torch.float64)
                 with torch.no_grad():
-                    rewards[step, cut] += gamma * agent.get_value(final_obs)
+                    rewards[step, cut] += gamma * agent.get_value(agent.normalize(final_obs))
 
         # Advantages. The policy was frozen in the rollout: values and log-probabilities of all its
         # steps come in one batch here, and not one by one in the loop above.
@@ -296,7 +295,6 @@ if __name__ == "__main__":
         runs.check_finite(iteration, stats, agent)
         for name, value in stats.items():
             writer.add_scalar(name, value, global_step)
-        bar.set_postfix(runs.shown(stats))
 
         # Save
         final = iteration == num_iterations
@@ -311,5 +309,6 @@ if __name__ == "__main__":
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
-            bar.write(f"{global_step:,} steps: " + runs.one_line(scores))
+            bar.write(f"{global_step:,} steps: {runs.one_line(scores)}")
+        bar.set_postfix(runs.shown(stats))
     writer.close()

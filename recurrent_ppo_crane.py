@@ -59,7 +59,7 @@ class Args:
     # task
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
-    env: Options = field(default_factory=Options)  # options of the task; its --help shows its own
+    env: Options = field(default_factory=Options)  # options of the task that --env-id names
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -76,7 +76,7 @@ class Args:
     ent_coef: Factor = 0.0  # c_e, weight of the entropy
     vf_coef: Factor = 0.5  # c_v, weight of the value loss
     max_grad_norm: Factor = 0.5  # bound of the gradient's norm
-    log_std_init: float = -1.2  # log sigma at the start [action units]
+    log_std_init: float = -1.2  # log sigma at the start; actions reach from -1 to 1
 
     # schedules (docs/training.md)
     curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
@@ -108,15 +108,15 @@ class Agent(nn.Module):
         self.actor = mlp([features, *args.hidden_sizes, len(action_low)], std=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
         self.critic = mlp([features, *args.hidden_sizes, 1], std=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float32))
-        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float32))
+        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float64))
+        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float64))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
-        self.register_buffer("obs_count", torch.tensor(1e-4, dtype=torch.float64))
+        self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
 
     def update_normalizer(self, obs: Tensor) -> None:
-        """Merge the mean and variance of obs (N, obs_dim) into the running ones (Chan et al.)."""
-        obs, new = obs.double(), len(obs)
+        """Merge mean and variance of obs (N, obs_dim), float64, into the running ones (Chan)."""
+        new = len(obs)
         count = self.obs_count + new
         delta = obs.mean(0) - self.obs_mean
         spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * new
@@ -125,9 +125,8 @@ class Agent(nn.Module):
         self.obs_count.copy_(count)
 
     def normalize(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std, clipped to +-10."""
-        scaled = (obs - self.obs_mean.float()) / torch.sqrt(self.obs_var.float() + 1e-8)
-        return scaled.clamp(-10, 10)
+        """(obs - mean) / std of obs in float64, as float32, clipped to +-10."""
+        return ((obs - self.obs_mean) / torch.sqrt(self.obs_var + 1e-8)).float().clamp(-10, 10)
 
     def initial_state(self, num_envs: int) -> State:
         """Empty memories of num_envs cranes."""
@@ -159,8 +158,10 @@ class Agent(nn.Module):
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
 
     def to_env(self, actions: Tensor) -> np.ndarray:
-        """Actions clipped to the environment's limits."""
-        return actions.clamp(self.action_low, self.action_high).cpu().numpy()
+        """Actions in the environment's units: -1 and 1 become the limits, if there are any."""
+        low, high = self.action_low, self.action_high
+        scaled = torch.where(high - low < 1e9, (low + high + (high - low) * actions) / 2, actions)
+        return scaled.clamp(low, high).cpu().numpy()
 
     @torch.no_grad()
     def predict(self, obs: np.ndarray, state: State = None, deterministic: bool = True) -> tuple:
@@ -168,7 +169,7 @@ class Agent(nn.Module):
 
         Where an episode begins, the state must be None, or zeros in the row of its crane.
         """
-        obs = torch.as_tensor(obs, dtype=torch.float32, device=self.obs_mean.device)
+        obs = torch.as_tensor(obs, dtype=torch.float64, device=self.obs_mean.device)
         state = self.initial_state(len(obs)) if state is None else state
         no_starts = torch.zeros(1, len(obs), device=obs.device)
         features, state = self.remember(self.normalize(obs)[None], state, no_starts)
@@ -179,8 +180,7 @@ class Agent(nn.Module):
 def compute_gae(
     rewards: Tensor, values: Tensor, next_value: Tensor, dones: Tensor, gamma: float, lam: float
 ) -> Tensor:
-    """Advantages (T, N). dones[t] says that step t ended an episode (in CleanRL: dones[t + 1]), and
-    next_value (N,) is V after the last step."""
+    """Advantages (T, N). dones[t] says that step t ended an episode (in CleanRL: dones[t + 1])."""
     advantages = torch.zeros_like(rewards)
     next_advantage = torch.zeros_like(next_value)
     for t in reversed(range(len(rewards))):
@@ -197,8 +197,8 @@ if __name__ == "__main__":
     batch_size = args.num_envs * args.num_steps
     num_iterations = max(1, args.total_timesteps // batch_size)
 
-    def to_tensor(x: np.ndarray) -> Tensor:
-        return torch.as_tensor(x, dtype=torch.float32, device=device)
+    def to_tensor(x: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.as_tensor(x, dtype=dtype, device=device)
 
     def difficulty(iteration: int) -> float:  # easy starts first; 1 is the full task
         return min(1.0, iteration / num_iterations / max(args.curriculum, 1e-9))
@@ -225,7 +225,7 @@ if __name__ == "__main__":
     actions = torch.zeros((args.num_steps, args.num_envs, action_space.shape[0]), device=device)
     rewards, dones, starts = torch.zeros((3, args.num_steps, args.num_envs), device=device)
     envs.unwrapped.difficulty = difficulty(first_iteration)  # it shapes the first starts
-    next_obs = to_tensor(envs.reset(seed=env_seed)[0])
+    next_obs = to_tensor(envs.reset(seed=env_seed)[0], torch.float64)
     next_start, state = torch.ones(args.num_envs, device=device), agent.initial_state(args.num_envs)
     todo = range(first_iteration, num_iterations + 1)
     for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
@@ -249,16 +249,17 @@ if __name__ == "__main__":
                 features, state = agent.remember(obs[step][None], state, next_start[None])
                 actions[step] = agent.get_distribution(features[0]).sample()
             next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
-            next_obs = to_tensor(next_obs)
+            next_obs = to_tensor(next_obs, torch.float64)
             rewards[step] = to_tensor(reward * reward_scale)
             dones[step] = next_start = to_tensor(terminated | truncated)
             infos.append(info)
             cut = truncated & ~terminated
             if cut.any():  # bootstrap: V stands for what the time limit cut off
-                final_obs = agent.normalize(to_tensor(np.stack(info["final_obs"][cut])))[None]
-                cut_state, no_starts = [part[cut] for part in state], torch.zeros(1, cut.sum())
+                final_obs = to_tensor(np.stack(info["final_obs"][cut]), torch.float64)
+                no_starts = torch.zeros(1, cut.sum(), device=device)
                 with torch.no_grad():
-                    features, _ = agent.remember(final_obs, cut_state, no_starts.to(device))
+                    final_obs = agent.normalize(final_obs)[None]
+                    features, _ = agent.remember(final_obs, [s[cut] for s in state], no_starts)
                     rewards[step, cut] += gamma * agent.get_value(features[0])
 
         # Advantages. The policy was frozen in the rollout: values and log-probabilities of all its
@@ -320,7 +321,6 @@ if __name__ == "__main__":
         runs.check_finite(iteration, stats, agent)
         for name, value in stats.items():
             writer.add_scalar(name, value, global_step)
-        bar.set_postfix(runs.shown(stats))
 
         # Save
         final = iteration == num_iterations
@@ -335,5 +335,6 @@ if __name__ == "__main__":
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
-            bar.write(f"{global_step:,} steps: " + runs.one_line(scores))
+            bar.write(f"{global_step:,} steps: {runs.one_line(scores)}")
+        bar.set_postfix(runs.shown(stats))
     writer.close()

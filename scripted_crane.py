@@ -25,7 +25,7 @@ Delta_p - T v, with the last command v. In k_s s the swing is replaced by s + T 
 Phases of each crane: APPROACH (over the log, turning along it), DESCEND, CLOSE, LIFT.
 
     python eval_crane.py scripted                    # --video and --viewer work too
-    python eval_crane.py scripted_crane:UnsignedScriptedCrane --env.no-signed-yaw
+    python eval_crane.py scripted_crane:UnsignedScriptedCrane --env.signed-yaw False
 """
 
 from typing import NamedTuple

@@ -50,7 +50,10 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
         default = restore_args(arguments, checkpoint)
     else:
         default = arguments(env_id=seen.env_id, env=trials.task_options(seen.env_id) or Options())
-    args = tyro.cli(arguments, default=default, description=description.partition("\n\n")[0])
+    summary = (description or "").partition("\n\n")[0]  # python -OO has no docstrings
+    # --env.signed-yaw False, and not a flag of its own for each value
+    config = (tyro.conf.FlagConversionOff,)
+    args = tyro.cli(arguments, default=default, description=summary, config=config)
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     return args, checkpoint
@@ -82,6 +85,10 @@ def restore(
 def make_folder(args: Any) -> Path:
     """The run's folder: that of --resume, or a new one with a copy of the script."""
     if args.resume:
+        # TensorBoard reads event files in the order of their names, which begin with the clock's
+        # time. A clock that was set back would hide the new updates.
+        for number, file in enumerate(sorted(args.resume.glob("events.out.tfevents.*"))):
+            file.rename(args.resume / f"events.out.tfevents.{number:010d}.resumed")
         return args.resume
     name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
     name = name.replace("/", "-").replace(":", "-")
@@ -153,7 +160,7 @@ def one_line(scores: dict[str, float]) -> str:
 def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> None:
     """SystemExit that names what is not finite after an update."""
     wrong = [name for name, value in stats.items() if value != value or abs(value) == float("inf")]
-    wrong += [name for name, weights in agent.state_dict().items() if not weights.isfinite().all()]
+    wrong += [name for name, weights in agent.named_parameters() if not weights.isfinite().all()]
     if wrong:
         raise SystemExit(
             f"update {iteration}: {', '.join(wrong[:3])} not finite. Lower --learning-rate (TRPO: "

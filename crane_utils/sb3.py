@@ -1,18 +1,15 @@
 """The cranes as a vectorized environment of Stable-Baselines3 (SB3), for its algorithms.
 
-    pip install stable-baselines3
-
-    import crane_trials
-    from sb3_crane import CraneVecEnv
+    from crane_utils import trials
+    from crane_utils.sb3 import CraneVecEnv
     from stable_baselines3 import SAC
     from stable_baselines3.common.vec_env import VecMonitor
 
     model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
     model.learn(100_000)
-    print(crane_trials.evaluate(model, "ForestryCrane-v0", trials=100, seed=10_000))
+    print(trials.evaluate(model, "ForestryCrane-v0", trials=100))
 
-SB3 wraps `gymnasium.make("ForestryCrane-v0")` itself, one crane at a time. This is faster: all
-cranes are simulated together.
+SB3 would simulate one crane at a time. This is faster: all cranes are simulated together.
 """
 
 from collections.abc import Sequence
@@ -20,10 +17,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-import crane_trials
+from crane_utils import trials
 
 
 class CraneVecEnv(VecEnv):
@@ -34,11 +30,9 @@ class CraneVecEnv(VecEnv):
     """
 
     def __init__(self, num_envs: int, env_id: str = "ForestryCrane-v0", **options: Any):
-        if not crane_trials.is_crane(env_id):
+        if not trials.crane_class(env_id):
             raise ValueError(f"{env_id} is not the crane; SB3's make_vec_env takes other tasks")
-        mode = AutoresetMode.SAME_STEP  # as SB3 expects it
-        envs = gymnasium.make_vec(env_id, num_envs, autoreset_mode=mode, **options)
-        self.envs = envs
+        self.envs = envs = gymnasium.make_vec(env_id, num_envs, **options).unwrapped
         super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> np.ndarray:
@@ -68,13 +62,10 @@ class CraneVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        values = self.envs.get_attr(attr_name)
-        return [values[i] for i in self._get_indices(indices)]
+        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        if indices is not None:
-            raise ValueError(f"all cranes share {attr_name}")
-        self.envs.set_attr(attr_name, value)
+        setattr(self.envs, attr_name, value)  # all cranes share it
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> None:
         raise NotImplementedError(f"the cranes are one object: call envs.{method_name} instead")

@@ -21,6 +21,7 @@ from numpy.random import SeedSequence
 from crane_env import CraneEnv, CraneVectorEnv
 
 DIAMETERS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # m, of the paper's tables
+MAX_STEPS = 10_000  # of an evaluation; a task may have no end
 EVAL_SEED = 10_000  # of trials while settings are chosen
 REPORT_SEED = 60_000  # of the trials behind every reported score
 
@@ -70,7 +71,23 @@ def make_envs(
     for space in (envs.single_observation_space, envs.single_action_space):
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
             raise SystemExit(f"{env_id}: observations and actions must be flat Boxes, not {space}")
-    return RecordEpisodeStatistics(envs)
+    if space.dtype.kind != "f":
+        raise SystemExit(f"{env_id}: actions must be floats, not {space}")
+    return RecordEpisodeStatistics(CheckFinite(envs))
+
+
+class CheckFinite(gymnasium.vector.VectorWrapper):
+    """FloatingPointError names an observation or a reward of the task that is not finite."""
+
+    def step(self, actions: Array) -> tuple:
+        obs, reward, *rest, info = super().step(actions)
+        ends = [end for end in info.get("final_obs", []) if end is not None]
+        for name, values in (("observation", obs), ("reward", reward), ("last observation", ends)):
+            if len(wrong := np.argwhere(~np.isfinite(values))):
+                env, *index = wrong[0].tolist()
+                value = np.asarray(values)[tuple(wrong[0])]
+                raise FloatingPointError(f"{name} {index or ''} of environment {env} is {value}")
+        return obs, reward, *rest, info
 
 
 def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[str, float]:
@@ -118,7 +135,7 @@ def run_trials(
     """
     obs, _ = envs.reset(seed=seeds)
     results, state, ended = {}, None, np.zeros(envs.num_envs, bool)
-    while not ended.all():
+    for _ in range(MAX_STEPS):
         actions, state = policy.predict(obs, state, deterministic=deterministic)
         obs, _, terminated, truncated, info = envs.step(actions)
         first = (terminated | truncated) & ~ended  # later ends belong to other episodes
@@ -129,7 +146,11 @@ def run_trials(
             for name, value in values.items():
                 results[name] = np.where(first, value, results.get(name, value))
         ended |= first
-    return results
+        if ended.all():
+            return results
+    print(f"{(~ended).sum()} of {len(ended)} episodes did not end within {MAX_STEPS:,} steps")
+    so_far = np.where(ended, results.get("episodic_return", 0.0), envs.episode_returns)
+    return results | {"episodic_return": so_far}
 
 
 def evaluate(
