@@ -384,7 +384,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.joint_range = model.jnt_range[JOINTS]  # (8, 2), rad and m
         _, integrators = np.split(model.actuator_gainprm, 2)
         self.servo_kp = np.tile(integrators[:, 0], (num_envs, 1))
-        self.max_lead = model.jnt_actfrcrange[SERVOS, 1] / self.servo_kp  # rad, m
+        # N m and N, lowest and highest that each servo may push with, (2, N, 8)
+        self.force_limit = np.tile(model.jnt_actfrcrange[SERVOS].T[:, None], (1, num_envs, 1))
 
         self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
         self.starts: list[tuple] = [()] * num_envs
@@ -489,7 +490,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self.rngs is None:
-            if seed is None or np.ndim(seed) == 0:
+            if np.ndim(seed) == 0:  # one, or None
                 seed = SeedSequence(seed).spawn(self.num_envs)
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
@@ -598,10 +599,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         due = self.steps % every == 0
         for start in range(0, self.frame_skip, self.PIECE):
             nstep = min(self.PIECE, self.frame_skip - start)
-            position = self.qpos[:, SERVOS]
-            low, high = position - self.max_lead, position + self.max_lead
-            np.clip(self.act, low, high, out=self.act, where=due[:, None])
             self.drive(np.flatnonzero(due), nstep * every * self.model.opt.timestep)
+            low, high = self.qpos[:, SERVOS] + self.force_limit / self.servo_kp
+            np.clip(self.act, low, high, out=self.act, where=due[:, None])
             last = start + nstep == self.frame_skip  # sensors are needed after this one only
             stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
             try:
@@ -772,9 +772,8 @@ class CraneEnv(gymnasium.Env):
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """`CraneVectorEnv.step` without autoreset. action (6,)."""
-        results = self.envs.step(np.asarray(action)[None])
-        obs, (reward, terminated, truncated), info = results[0], results[1:4], results[4]
-        return obs[0], reward.item(), terminated.item(), truncated.item(), self.of_one(info)
+        obs, *numbers, info = self.envs.step(np.asarray(action)[None])
+        return obs[0], *[number.item() for number in numbers], self.of_one(info)
 
     def of_one(self, info: dict[str, Array]) -> dict[str, Any]:
         """The one crane's info, in Python's numbers, bools and strings."""

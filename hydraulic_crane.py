@@ -3,11 +3,11 @@
     import gymnasium
     envs = gymnasium.make_vec("crane_env:ForestryCraneHydraulic-v0", num_envs=64)
 
-The task is that of crane_env.py. This file overrides its hooks and needs nothing else: it is also
-the example of a task of one's own. A commanded speed passes the lag of a valve, the limit of the
-pump and a dead time. The resulting speed moves the rest position of a spring. The force of the
-spring is limited and drives a damped joint. In `ForestryCraneRandomized-v0` each episode draws
-drives, a log, friction and sensor errors. Sources of all numbers: assets/README.md.
+The task is that of crane_env.py, and this file overrides its hooks: it is also the example of a
+task of one's own. A commanded speed passes the lag of a valve, the limit of the pump and a dead
+time. The resulting speed moves the rest position of a spring. Its force, limited by the pump's
+pressure, drives a damped joint. In `ForestryCraneRandomized-v0` each episode draws drives, a log,
+friction and sensor errors. Sources of all numbers: assets/README.md.
 
 With `sensors` the observation has 32 numbers, what the machine measures:
 
@@ -49,6 +49,7 @@ DEAD_TIME = np.array([0.117, 0.080, 0.044, 0.060, 0.058, 0.058])  # s
 BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
+PRESSURE = 25e6  # Pa, the pump's; no cylinder pushes harder than its area times this
 MIN_LEVER = 0.05  # m; below q2 = -1.13 rad the boom's computed lever is smaller or negative
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
 # The oil of the telescope's rod side helps to extend it. q8 moves its cylinder 0.292 m in 3 rad.
@@ -56,38 +57,28 @@ OIL = np.array(
     [[12.724e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
      [12.724e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
+FULL_TELESCOPE = 3.849e-3  # m^3/m, and m^2, where the load is too heavy for the rod side to help
+SERVOS_OF_ACTION = np.array([1, 1, 1, 2, 1, 2])  # that share a cylinder's force
 FIRST_SERVO = [0, 1, 2, 3, 5, 6]  # of each command: the first telescope stage, the outer jaw
 PASSIVE = [4, 5]  # of our q1 ... q8
 
 # What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
 # damping are wide, so their logarithms are uniform. All else is uniform.
 DRAWN = {
-    "stiffness": (
-        STIFFNESS,
-        np.array([2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4]),
-        np.array([3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),
-    ),
-    "damping": (
-        DAMPING,
-        np.array([6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 2.7e3]),
-        np.array([1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 4.3e3]),
-    ),
+    "stiffness": (STIFFNESS, [2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4],
+                  [3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),
+    "damping": (DAMPING, [6.32e3, 6.62e4, 3.29e4, 8.03e3, 62.9, 2.7e3],
+                [1.65e4, 3.81e5, 7.05e4, 1.61e5, 1596.0, 4.3e3]),
     "extra_delay": (0.0, -0.02, 0.02),  # s, added to the dead time of all joints
-    "gain": (  # factor on the speed, in the negative and the positive direction
-        np.ones((2, 6)),
-        np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
-        np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1)),
-    ),
+    "gain": (np.ones((2, 6)), np.tile([0.98, 0.93, 0.95, 0.90, 1.05, 0.9], (2, 1)),
+             np.tile([1.02, 1.15, 1.20, 1.25, 1.20, 1.1], (2, 1))),  # on speed, by direction
     "density": (crane_env.LOG_DENSITY, 450.0, 950.0),  # kg/m^3
     "friction": (1.0, 0.5, 1.5),  # factor on that of all surfaces
     "pose_error": (np.zeros(3), np.full(3, -0.057), np.full(3, 0.057)),  # m, 0.1 m at most
     "yaw_error": (0.0, -0.1745, 0.1745),  # rad
     "joint_error": (np.zeros(8), -0.0087 * (np.arange(8) != 3), 0.0087 * (np.arange(8) != 3)),
     "swing": (np.zeros(2), np.full(2, -0.1745), np.full(2, 0.1745)),  # rad, of q5 and q6
-}
-
-# ---- the reward, where soft drives need another one
-
+}  # fmt: skip
 EMPTY_GRIP = 0.5  # share of r_grapple for closed jaws without a log; a grip earns all
 
 
@@ -126,10 +117,17 @@ def cylinder_levers(q2: Array, q3: Array) -> Array:
     return np.maximum(levers, MIN_LEVER)
 
 
-def oil_per_movement(q: Array, dq: Array) -> Array:
-    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6)."""
+def oil_per_movement(q: Array, dq: Array, force: Array) -> Array:
+    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6).
+
+    The same number times a pressure in Pa is the torque or force in that direction, in N m and N.
+    force (N, 6) is that of the drives: a telescope that needs more than the rod side leaves it runs
+    on its full area, and takes that oil.
+    """
     oil = np.where(dq < 0, OIL[0], OIL[1])
     oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+    loaded = (dq[:, 3] >= 0) & (force[:, 3] > PRESSURE * OIL[1, 3])
+    oil[loaded, 3] = FULL_TELESCOPE
     return oil
 
 
@@ -152,8 +150,9 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         super().__init__(num_envs, **kwargs)
-        names = ("actuator_gainprm", "actuator_biasprm", "actuator_delay", "dof_damping")
-        self.engine = {name: self.batch.expand(name) for name in (*names, "geom_friction")}
+        names = ["actuator_gainprm", "actuator_biasprm", "actuator_delay", "actuator_forcerange"]
+        names += ["dof_damping", "geom_friction"]
+        self.engine = {name: self.batch.expand(name) for name in names}
         self.drawn = {
             name: np.tile(nominal, (num_envs, *[1] * np.ndim(nominal)))
             for name, (nominal, _, _) in DRAWN.items()
@@ -163,8 +162,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     # ---- the model and the start of an episode
 
-    def make_spec(self) -> mujoco.MjSpec:
-        """The crane's servos become drives."""
+    def make_spec(self) -> mujoco.MjSpec:  # the servos become drives
         spec = super().make_spec()
         for index, action in zip(SERVOS, ACTION_OF_SERVO):
             joint = spec.joints[index]
@@ -173,6 +171,8 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
             spring = spec.actuator(f"{joint.name}_integral")
             spring.gainprm[0], spring.biasprm[1] = STIFFNESS[action], -STIFFNESS[action]
             spring.delay, spring.nsample = DEAD_TIME[action], MAX_DELAY
+            spring.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            spring.forcerange = joint.actfrcrange
         return spec
 
     def draw_episode(self, i: int) -> tuple[Array, Array, float]:
@@ -191,33 +191,44 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         return q + swing, log_pose, diameter
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
-        """Valves start as in a crane at rest."""
         self.valve_speed[ids] = self.telescope_wait[ids] = 0
         super().place(ids, q, log_pose, diameter)
 
     def set_constants(self, ids: Array, radius: Array) -> None:
         """Also give the engine what was drawn."""
+        model, engine = self.model, self.engine
         drawn = {name: values[ids] for name, values in self.drawn.items()}
         self.density[ids] = drawn["density"]
         super().set_constants(ids, radius)
-        stiffness = drawn["stiffness"][:, ACTION_OF_SERVO]
-        self.servo_kp[ids] = stiffness
-        self.max_lead[ids] = self.model.jnt_actfrcrange[SERVOS, 1] / stiffness
-        self.engine["actuator_gainprm"][ids, 8:, 0] = stiffness
-        self.engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
-        self.engine["dof_damping"][np.ix_(ids, SERVOS)] = drawn["damping"][:, ACTION_OF_SERVO]
-        delay = self.model.actuator_delay[8:] + drawn["extra_delay"][:, None]
-        self.engine["actuator_delay"][ids, 8:] = delay
-        friction = self.model.geom_friction * drawn["friction"][:, None, None]
-        self.engine["geom_friction"][ids] = friction
+        self.servo_kp[ids] = stiffness = drawn["stiffness"][:, ACTION_OF_SERVO]
+        engine["actuator_gainprm"][ids, 8:, 0] = stiffness
+        engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
+        engine["actuator_delay"][ids, 8:] = model.actuator_delay[8:] + drawn["extra_delay"][:, None]
+        engine["dof_damping"][np.ix_(ids, SERVOS)] = drawn["damping"][:, ACTION_OF_SERVO]
+        engine["geom_friction"][ids] = model.geom_friction * drawn["friction"][:, None, None]
 
     # ---- what moves the joints
 
     def drive(self, ids: Array, seconds: float) -> None:
         """The mean speed that valves and pump give in the next seconds moves the springs."""
         command, gain = self.command[ids], self.drawn["gain"][ids]
-        command = np.where(command < 0, gain[:, 0], gain[:, 1]) * command
-        self.ctrl[ids, 8:] = self.oil_speed(ids, command, seconds)[:, ACTION_OF_SERVO]
+        self.limit_forces(ids)
+        wanted = np.where(command < 0, gain[:, 0], gain[:, 1]) * command
+        self.ctrl[ids, 8:] = self.oil_speed(ids, wanted, seconds)[:, ACTION_OF_SERVO]
+
+    def limit_forces(self, ids: Array) -> None:
+        """No drive of cranes `ids` pushes harder than PRESSURE allows where its joint is now."""
+        q, way = self.qpos[ids], np.ones((len(ids), 6))
+        heavy = np.inf * way  # the telescope may use its full area
+        areas = np.array([oil_per_movement(q, -way, heavy), oil_per_movement(q, way, heavy)])
+        most = (PRESSURE * areas / SERVOS_OF_ACTION)[:, :, ACTION_OF_SERVO]
+        most = np.minimum(most, self.model.jnt_actfrcrange[SERVOS, 1])
+        self.force_limit[:, ids] = low, high = -most[0], most[1]
+        self.engine["actuator_forcerange"][ids, 8:] = np.stack([low, high], axis=-1)
+
+    def spring_force(self) -> Array:
+        """Force of the oil on each servo's joint, (N, 8), N m and N."""
+        return np.clip(self.servo_kp * (self.act - self.qpos[:, SERVOS]), *self.force_limit)
 
     def oil_speed(self, ids: Array, command: Array, seconds: float) -> Array:
         """Mean speed (n, 6), rad/s and m/s, that the oil gives cranes `ids` in the next seconds.
@@ -235,7 +246,8 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         decay = np.exp(-seconds / LAG)
         mean = target + (speed - target) * LAG / seconds * (1 - decay)
         self.valve_speed[ids] = target + (speed - target) * decay
-        oil = oil_per_movement(self.qpos[ids], mean)
+        force = self.spring_force()[ids] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
+        oil = oil_per_movement(self.qpos[ids], mean, force)
         demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
         return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
 
@@ -262,8 +274,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
             return obs
         last_command = self.command / speed_limit(self.command)
         rates = self.qvel[:, JOINTS][:, PASSIVE]
-        force = self.servo_kp * (self.act - self.qpos[:, SERVOS])
-        force = np.clip(force / self.model.jnt_actfrcrange[SERVOS, 1], -1, 1)[:, FIRST_SERVO]
+        force = (self.spring_force() / self.model.jnt_actfrcrange[SERVOS, 1])[:, FIRST_SERVO]
         return np.concatenate([obs, last_command, rates, force], axis=-1)
 
     def measure(self, state: CraneState) -> dict[str, Array]:
@@ -273,11 +284,9 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         return info
 
     def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
-        """Soft drives lose what stiff servos hold.
+        """Soft drives lose what stiff servos hold, so only a grip earns all of r_grapple.
 
-        So empty jaws earn at most half of r_grapple and a grip earns all. A grip lifts in full
-        where the tips are half a radius or more below the log's centre, and not at all where they
-        are half a radius above it.
+        It lifts in full where the tips are half a radius below the log's centre or deeper.
         """
         closed, grip = super().grasp(state, miss)
         held = state.touching.all(axis=-1)

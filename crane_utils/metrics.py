@@ -41,7 +41,7 @@ class Metrics:
         q, dq = envs.qpos[:, JOINTS], envs.qvel[:, JOINTS][:, ACTUATED]
         dq = dq * ~envs.warned()[:, None]  # the engine has reset those
         force = self.drive_force[:, SERVOS] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
-        oil = oil_per_movement(q, dq)
+        oil = oil_per_movement(q, dq, force)
         flow = np.sum(oil * np.abs(dq), axis=-1)
         moving = np.abs(dq) > MOVING * np.minimum(*np.abs(SPEED_LIMITS))
         pressure = np.max(np.maximum(force * np.sign(dq) / oil, 0) * moving, axis=-1)
