@@ -69,6 +69,7 @@ from pydantic.dataclasses import dataclass
 # ---- the machine
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
+VEL = mujoco.mjtStage.mjSTAGE_VEL  # the engine's stage that makes positions and sensors current
 SPEED_LIMITS = np.array(  # lowest and highest of q1, q2, q3, q4, q7, q8: rad/s, per stage m/s
     [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
 )
@@ -319,8 +320,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     `difficulty` in [0, 1] eases the starts (1 is the full task), `retry` in [0, 1] is the largest
     share of episodes that repeat a failed start. Both may be set at any time. `observers` are
-    called as observer(envs, seconds) after each piece of a step, which is PIECE physics steps long
-    or less.
+    called as observer(envs) after each physics step.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -352,8 +352,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.options = self.Options(**options)
         self.num_envs, self.difficulty, self.retry = num_envs, difficulty, retry
         self.render_mode, self.camera, self.frame_size = render_mode, camera, (height, width)
-        self.viewer: Any = None
-        self.autoreset, self.observers = autoreset, []
+        self.viewer, self.autoreset, self.observers = None, autoreset, []
         if diameter is not None:
             diameter = np.broadcast_to(np.asarray(diameter, float), num_envs)
             if not np.all((D_MIN <= diameter) & (diameter <= D_MAX)):
@@ -564,7 +563,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.qpos[np.ix_(ids, SERVOS)] = q[:, ACTUATED][:, ACTION_OF_SERVO]
         self.set_constants(ids, radius)
         self.batch.set_const(ids)  # bounding volumes and inverse weights follow
-        self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.batch.forward(ids, stage=VEL)
 
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
@@ -602,18 +601,19 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.drive(np.flatnonzero(due), nstep * every * self.model.opt.timestep)
             low, high = self.qpos[:, SERVOS] + self.force_limit / self.servo_kp
             np.clip(self.act, low, high, out=self.act, where=due[:, None])
-            last = start + nstep == self.frame_skip  # sensors are needed after this one only
-            stage = mujoco.mjtStage.mjSTAGE_VEL if last else mujoco.mjtStage.mjSTAGE_NONE
-            try:
-                self.batch.step(nstep=nstep, stage=stage)
-            except SimulationError as error:
-                failed[error.ids] = True
+            for size in [1] * nstep if self.observers else [nstep]:
+                start += size  # sensors are needed after the last physics step only
+                stage = VEL if start == self.frame_skip else mujoco.mjtStage.mjSTAGE_NONE
+                try:
+                    self.batch.step(nstep=size, stage=stage)
+                except SimulationError as error:
+                    failed[error.ids] = True
+                for observer in self.observers:
+                    observer(self)
             ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1)
             ground[self.warned()] = 0.0  # the engine has reset them
             self.impact = np.maximum(self.impact, ground.max(axis=-1))
             self.ground_peak = np.maximum(self.ground_peak, self.impact)
-            for observer in self.observers:
-                observer(self, nstep * self.model.opt.timestep)
         finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
         return failed | self.warned() | ~finite
 

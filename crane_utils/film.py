@@ -122,10 +122,10 @@ def film(
     frames = round(crane.TIME_LIMIT * FPS) * len(diameters)  # at most
     successes, waited = [], 0.0
 
-    def shoot(crane: CraneVectorEnv, seconds: float) -> None:
+    def shoot(crane: CraneVectorEnv) -> None:
         """A frame each time that 1 / FPS s have passed."""
         nonlocal waited
-        waited += seconds
+        waited += crane.model.opt.timestep
         if waited > 1 / FPS - 1e-9:
             waited -= 1 / FPS
             video.append_data(frame(crane, caption(crane, name, metrics)))
@@ -182,7 +182,15 @@ def window(
     crane.viewer.cam.fixedcamid = crane.model.camera(camera).id
     shown_groups = crane.viewer.opt.geomgroup.copy()
     by_hand, paused, restart, speed, drawn_at = False, False, True, 1.0, time.time()
-    levers, failure = np.zeros(6), None
+    levers, failure, waited = np.zeros(6), None, 0.0
+
+    def watch(crane: CraneVectorEnv) -> None:
+        """Draw each time that half of 1 / FPS s have passed."""
+        nonlocal waited
+        waited += crane.model.opt.timestep
+        if waited > 0.5 / FPS - 1e-9:
+            draw(crane, waited)
+            waited = 0.0
 
     def draw(crane: CraneVectorEnv, seconds: float) -> None:
         """Draw the crane and wait until the clock has caught up."""
@@ -195,7 +203,7 @@ def window(
         time.sleep(max(0.0, drawn_at + seconds / speed - time.time()))
         drawn_at = time.time()
 
-    crane.observers.append(draw)
+    crane.observers.append(watch)
     while crane.viewer.is_running():
         while pressed:
             key = KEYS.get(pressed.popleft())

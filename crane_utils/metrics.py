@@ -1,4 +1,4 @@
-"""What an episode costs: oil, energy, swing and time, observed after each piece of a step.
+"""What an episode costs: oil, energy, swing and time, observed after each physics step.
 
 metrics = Metrics(envs.unwrapped)  # before the first step
 results = run_trials(policy, envs, seeds, metrics=metrics)
@@ -29,15 +29,16 @@ class Metrics:
         self.drive_force = envs.batch.bind("qfrc_actuator")
         self.values = {name: np.zeros(n) for name in ("litres", "energy", "swing_peak", "time_up")}
         self.values["time_up"][:] = np.inf
-        envs.observers.append(self.after_piece)
+        envs.observers.append(self.after_physics_step)
 
     def clear(self, ids: Array) -> None:
         """New episodes of cranes `ids`."""
         for name, value in self.values.items():
             value[ids] = np.inf if name == "time_up" else 0.0
 
-    def after_piece(self, envs: CraneVectorEnv, seconds: float) -> None:
-        """Add what the last piece of a step took, with the joints as they are at its end."""
+    def after_physics_step(self, envs: CraneVectorEnv) -> None:
+        """Add what the last physics step took."""
+        seconds = envs.model.opt.timestep
         q, dq = envs.qpos[:, JOINTS], envs.qvel[:, JOINTS][:, ACTUATED]
         dq = dq * ~envs.warned()[:, None]  # the engine has reset those
         force = self.drive_force[:, SERVOS] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
