@@ -141,7 +141,8 @@ def run_trials(
         first = (terminated | truncated) & ~ended  # later ends belong to other episodes
         values = {} if metrics is None else metrics.after_step(info)
         if first.any():
-            values |= {name: v for name, v in info.items() if isinstance(v, Array) and v.ndim == 1}
+            numbers = {k: v for k, v in info.items() if isinstance(v, Array) and v.ndim == 1}
+            values |= {k: v for k, v in numbers.items() if k[0] != "_" and v.dtype != object}
             values["episodic_return"] = info["episode"]["r"]
             for name, value in values.items():
                 results[name] = np.where(first, value, results.get(name, value))

@@ -5,13 +5,12 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import torch
-from script_runs import ROOT
 
-import crane_runs
-
+ROOT = Path(__file__).parents[1]
 torch.set_num_threads(1)  # the batches are too small for more
 
 
@@ -19,9 +18,8 @@ torch.set_num_threads(1)  # the batches are too small for more
 def run_here(tmp_path, monkeypatch):
     """run_here(algorithm, *arguments, cwd=tmp_path) gives the variables that the script left.
 
-    As `script_runs.run`, without the seconds that a new process takes to import torch.
+    It saves the seconds that a new process takes to import torch.
     """
-
     for module in (sys, threading):
         monkeypatch.setattr(module, "excepthook", module.excepthook)  # what scripts set ends here
 
@@ -32,17 +30,17 @@ def run_here(tmp_path, monkeypatch):
         monkeypatch.chdir(cwd)
         file = str(ROOT / f"{algorithm}_crane.py")
         monkeypatch.setattr(sys, "argv", [file, *map(str, arguments)])
+        monkeypatch.setattr(sys, "path", [*sys.path])  # scripts add the current folder
         threads, handlers = torch.get_num_threads(), {}
-        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for name in {"SIGINT", "SIGTERM", "SIGHUP"} & set(dir(signal)):
             # where the tests run in the background, some are ignored, and scripts respect that
-            handlers[signum] = signal.signal(signum, signal.SIG_DFL)
+            number = getattr(signal, name)
+            handlers[number] = signal.signal(number, signal.SIG_DFL)
         try:
             return runpy.run_path(file, run_name="__main__")
         finally:
             torch.set_num_threads(threads)
-            while crane_runs.LOCKS:  # which a script holds until its process ends
-                crane_runs.LOCKS.pop().release()
-            for signum, handler in handlers.items():
-                signal.signal(signum, handler)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
     return run

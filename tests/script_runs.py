@@ -1,64 +1,105 @@
-"""Running the algorithm scripts as a user would, at a small size."""
+"""Runs of the scripts inside the test's own process, and what can be seen of them."""
 
-import importlib
-import os
-import subprocess
+import contextlib
+import runpy
+import signal
 import sys
+from collections import defaultdict
+from copy import deepcopy
 from pathlib import Path
+from unittest import mock
 
-import numpy as np
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+import torch
+import torch.utils.tensorboard
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from torch.distributions import Beta, Normal
 
 ROOT = Path(__file__).parent.parent
-ALGORITHMS = ["mppo_beta", "ppo", "trpo", "recurrent_ppo"]
-TWO = ["mppo_beta", "trpo"]  # for what crane_runs.py does in the same way for all
-SMALL = "--num-envs 4 --num-steps 16 --update-epochs 2 --hidden-sizes 16 16 --eval-trials 1"
-SMALL = [*SMALL.split(), "--final-trials", "0", "--env-threads", "1", "--torch-threads", "1"]
+ALGORITHMS = ["mppo_beta_crane", "ppo_crane", "trpo_crane", "recurrent_ppo_crane"]
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def small(algorithm):
-    """Two minibatches of 32 decisions."""
-    if algorithm == "recurrent_ppo":
-        return [*SMALL, "--num-minibatches", "2", "--lstm-size", "8"]
-    return [*SMALL, "--minibatch-size", "32"]
+class Recording:
+    """What a script did. `run` may be called again, for another run in the same folder.
 
+    scalars: {tag: {global step: value}}. first: the weights before the first update. updates: what
+    the script has after each update. starts, steps: what the training's environments gave and
+    took. samples: what the policy drew. permutations: of `torch.randperm`.
+    """
 
-def one_minibatch(algorithm):
-    flag = "--num-minibatches 1" if algorithm == "recurrent_ppo" else "--minibatch-size 64"
-    return [*small(algorithm), *flag.split(), "--update-epochs", "1", "--total-timesteps", "64"]
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.scalars, self.purge_steps = defaultdict(dict), []
+        self.first, self.updates = [], []
+        self.starts, self.steps, self.samples, self.permutations = [], [], [], []
 
+    def begin(self, folder: Path, purge_step: int) -> "Recording":
+        """TensorBoard's writer is this recording."""
+        self.purge_steps.append(purge_step)
+        self.first.append(deepcopy(self.script["agent"].state_dict()))
+        return self
 
-def module(algorithm):
-    return importlib.import_module(f"{algorithm}_crane")
+    def add_scalar(self, tag: str, value: float, step: int) -> None:
+        """The first number of an update follows the update."""
+        self.scalars[tag][step] = float(value)
+        if not tag.startswith("eval/") and self.seen != self.script["iteration"]:
+            self.seen = self.script["iteration"]
+            kept = {"step": step, "actions": self.script["actions"]}
+            kept |= {"weights": self.script["agent"].state_dict()}
+            kept |= {"difficulty": self.script["envs"].unwrapped.difficulty}
+            self.updates.append(deepcopy(kept))
 
+    def add_text(self, *args) -> None: ...
 
-def make_agent(algorithm, obs_dim=18, act_dim=6, **args):
-    script = module(algorithm)
-    bound = np.ones(act_dim)
-    return script.Agent(obs_dim, -bound, bound, script.Args(**{"hidden_sizes": (8,)} | args))
+    def close(self) -> None: ...
 
+    @property
+    def script(self) -> dict:
+        """The variables of the script that runs."""
+        return vars(sys.modules["__main__"])
 
-def command(algorithm, *arguments):
-    return [sys.executable, str(ROOT / f"{algorithm}_crane.py"), *map(str, arguments)]
+    def watch(self, owner, name: str, keep) -> mock._patch:
+        """A patch: keep(object, arguments, result) sees each call of a method or function."""
+        method = getattr(owner, name)
 
+        def call(*args, **kwargs):
+            result = method(*args, **kwargs)
+            keep(args, deepcopy(result))
+            return result
 
-def environment():
-    return {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
+        return mock.patch.object(owner, name, call)
 
+    def keep_start(self, args: tuple, result: tuple) -> None:
+        if args[0] is self.script.get("envs"):  # and not those of an evaluation
+            self.starts.append(result[0])
 
-def run(algorithm, cwd, *arguments):
-    line = command(algorithm, *arguments)
-    result = subprocess.run(line, cwd=cwd, env=environment(), capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr[-2000:]
-    return result
+    def keep_step(self, args: tuple, result: tuple) -> None:
+        if args[0] is self.script.get("envs"):
+            names = ("obs", "reward", "terminated", "truncated", "info")
+            step = dict(zip(names, result)) | {"actions": args[1].copy()}
+            step["final_obs"] = [*step["info"].get("final_obs", [None] * len(step["obs"]))]
+            self.steps.append(step)
 
-
-def only_run(cwd):
-    (run_dir,) = (Path(cwd) / "runs").iterdir()
-    return run_dir
-
-
-def scalars(run_dir):
-    events = EventAccumulator(str(run_dir))
-    events.Reload()
-    return {tag: [e.value for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    def run(self, script: str, *arguments) -> dict:
+        """Run a script with these words as arguments; the variables that it left."""
+        words = [word for argument in arguments for word in str(argument).split()]
+        path, self.seen = str(ROOT / f"{script}.py"), None
+        keep_sample = lambda args, result: self.samples.append(result)  # noqa: E731
+        keep_permutation = lambda args, result: self.permutations.append(result.tolist())  # noqa: E731
+        with contextlib.ExitStack() as stack:
+            for patch in [
+                mock.patch.object(sys, "argv", [path, *words]),
+                mock.patch.object(sys, "path", sys.path[:]),
+                mock.patch.object(torch.utils.tensorboard, "SummaryWriter", self.begin),
+                self.watch(RecordEpisodeStatistics, "reset", self.keep_start),
+                self.watch(RecordEpisodeStatistics, "step", self.keep_step),
+                self.watch(torch, "randperm", keep_permutation),
+                self.watch(Beta, "sample", keep_sample),
+                self.watch(Normal, "sample", keep_sample),
+                contextlib.chdir(self.folder),
+            ]:
+                stack.enter_context(patch)
+            stack.callback(torch.set_num_threads, torch.get_num_threads())
+            for number in SIGNALS:  # a test in the background ignores some, and scripts respect it
+                stack.callback(signal.signal, number, signal.signal(number, signal.SIG_DFL))
+            return runpy.run_path(path, run_name="__main__")
