@@ -145,11 +145,17 @@ def task_of(policy: Any, trained: dict, args: Args, flags: list[str]) -> tuple[s
     for name, values in differs.items():
         print(f"the policy was made for {name} {values}", file=sys.stderr)
     envs = trials.make_envs(env_id, 1, 1, asdict(options))
-    width = envs.single_observation_space.shape[0]
-    wanted = len(policy.obs_mean) if hasattr(policy, "obs_mean") else width
-    if wanted != width:
-        raise SystemExit(f"the policy observes {wanted} numbers, and {env_id} gives {width}")
+    observed, acted = envs.single_observation_space, envs.single_action_space
+    has = describe(observed.shape[0], acted.low, acted.high)
+    if hasattr(policy, "obs_mean"):
+        needs = describe(len(policy.obs_mean), policy.action_low, policy.action_high)
+        if needs != has:
+            raise SystemExit(f"the policy has {needs}, and {env_id} has {has}")
     return env_id, options
+
+
+def describe(observations: int, low: Any, high: Any) -> str:
+    return f"{observations} observations and actions from {low.tolist()} to {high.tolist()}"
 
 
 def play(policy: Any, env_id: str, options: Options, args: Args) -> Iterator[dict]:

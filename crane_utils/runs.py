@@ -89,6 +89,7 @@ def make_folder(args: Any) -> Path:
         # time. A clock that was set back would hide the new updates.
         for number, file in enumerate(sorted(args.resume.glob("events.out.tfevents.*"))):
             file.rename(args.resume / f"events.out.tfevents.{number:010d}.resumed")
+        shutil.copy(sys.argv[0], args.resume)  # it may have been edited since
         return args.resume
     name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
     name = name.replace("/", "-").replace(":", "-")
@@ -182,11 +183,13 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
         script = Path(__file__).parents[1] / saved["script"]
     if not script.is_file():
         raise SystemExit(f"{path} needs {saved['script']}, whose Agent it holds, beside it")
-    spec = importlib.util.spec_from_file_location(script.stem, script)
+    spec = importlib.util.spec_from_file_location(f"script_of_{path.parent.name}", script)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[script.stem] = module  # where dataclasses look for it
+    sys.modules[spec.name] = module  # where dataclasses look for it
     spec.loader.exec_module(module)
     weights = saved["weights"]
+    if wrong := [name for name, w in weights.items() if w.isnan().any()]:
+        raise SystemExit(f"{path}: {', '.join(wrong[:3])} not finite")
     bounds = weights["action_low"].numpy(), weights["action_high"].numpy()
     agent = module.Agent(len(weights["obs_mean"]), *bounds, restore_args(module.Args, saved))
     # policy.pt has no critic, and acting needs none
