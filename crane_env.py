@@ -113,7 +113,8 @@ GRAPPLE_MISS = 0.5  # m off the log's centre at which r_grapple falls to 1/e
 LIFT_MISS = 0.25  # m off the log's centre at which r_lift falls to 1/e
 CARRY_WEIGHT = 1.0  # part of r_lift where the jaws carry the whole log: leads to the first lift
 
-STRICT = {"strict": True, "allow_inf_nan": False}  # of pydantic: no "3" for 3, no 1 for True
+# of pydantic: no unknown names, no "3" for 3, no 1 for True
+STRICT = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 
 @dataclass(config=STRICT)
@@ -386,20 +387,18 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # N m and N, lowest and highest that each servo may push with, (2, N, 8)
         self.force_limit = np.tile(model.jnt_actfrcrange[SERVOS].T[:, None], (1, num_envs, 1))
 
-        self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
-        self.starts: list[tuple] = [()] * num_envs
+        self.rngs, self.starts = None, [()] * num_envs  # three generators and a start each
         self.density = np.full(num_envs, LOG_DENSITY)  # kg/m^3
         self.command = np.zeros((num_envs, 6))  # rad/s, m/s
         self.steps = np.zeros(num_envs, int)  # since the start of each episode
         self.reach_time = np.full(num_envs, np.inf)  # s
         self.streaks: dict[str, Array] = {}  # for how many steps each of `conditions` has held
-        self.impact = np.zeros(num_envs)  # N, largest force on the ground in the last step
-        self.ground_peak = np.zeros(num_envs)  # N, in the episode
+        # N, largest force of the crane on the ground in the last step, and in the episode
+        self.impact, self.ground_peak = np.zeros((2, num_envs))
         draws = self.max_steps + 1 if self.options.pose_noise == "step" else 1
         self.noise = np.zeros((num_envs, draws, 2))  # epsilon_p, epsilon_o
 
-        low, high = np.float32(self.observation_limits())
-        self.single_observation_space = gymnasium.spaces.Box(low, high)
+        self.single_observation_space = gymnasium.spaces.Box(*np.float32(self.observation_limits()))
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -435,8 +434,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         # measure
         info = self.measure(state) | {"time": time}
-        in_time = time < self.REACH_TIME + 1e-9
-        reached = (info["d_combine"] < REACH_DISTANCE) & in_time
+        reached = self.reached(info) & (time < self.REACH_TIME + 1e-9)
         self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
         info["time_to_reach"] = self.reach_time.copy()
         terms = self.reward_terms(state, info)
@@ -448,9 +446,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         rules = self.rules(state, diverged)
         late = time > self.TIME_LIMIT - 1e-9
         ending = np.select([*rules.values(), late], [*rules, "time_limit"], default="none")
-        truncated = ending == "time_limit"
-        terminated = (ending != "none") & ~truncated
-        done = terminated | truncated
+        done, truncated = ending != "none", ending == "time_limit"
+        terminated = done & ~truncated
 
         # success: each condition held at every step of the last HOLD_TIME, no rule ended it early
         holds = self.conditions(state, info)
@@ -503,8 +500,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.start_episodes(np.arange(self.num_envs))
         state = self.state()
         info = self.measure(state)
-        everywhere = np.ones(self.num_envs, bool)
-        return self.observation(state), info | {f"_{key}": everywhere for key in info}
+        masks = {f"_{key}": np.ones(self.num_envs, bool) for key in info}
+        return self.observation(state), info | masks
 
     # ---- hooks: the model, the start of an episode
 
@@ -540,8 +537,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """Draw crane i's next start, as `sample_start` gives it, and its pose errors."""
         if not 0 <= self.difficulty <= 1:
             raise ValueError(f"difficulty must be in [0, 1], got {self.difficulty}")
-        start_rng, noise_rng, _ = self.rngs[i]
-        failures = self.failures[i]
+        (start_rng, noise_rng, _), failures = self.rngs[i], self.failures[i]
         retry = self.retry * np.mean(self.recent_success[i] or 0.0)  # 0 at first
         if retry and failures and start_rng.random() < retry:
             self.starts[i] = failures[start_rng.integers(len(failures))]
@@ -675,6 +671,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "log_mass": self.batch.body("log").mass[:, 0].copy(),
             "ground_peak": self.ground_peak.copy(),
         }
+
+    def reached(self, info: dict[str, Array]) -> Array:
+        """Whether the log is reached now, (N,) bool. `rules` end an episode that is late for it."""
+        return info["d_combine"] < REACH_DISTANCE
 
     def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """The reward's terms, (N,) each, by name. Their sum is the reward."""

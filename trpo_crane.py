@@ -375,6 +375,6 @@ if __name__ == "__main__":
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
-            bar.write(f"{global_step:,} steps: {runs.one_line(scores)}")
-        bar.set_postfix(runs.shown(stats))
+            bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
+        bar.set_postfix_str(runs.brief(stats))
     writer.close()

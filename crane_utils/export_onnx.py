@@ -2,9 +2,7 @@
 
     python -m crane_utils.export_onnx assets/policies/ppo_crane.pt ppo_crane.onnx
 
-The file computes what the agent's `predict` does: actions, float32 (N, 6), of obs, float32
-(N, 18 or 32). `h` and `c` are the memory of recurrent PPO, zeros at the start of an episode. Other
-policies have neither.
+`h` and `c` are the memory of recurrent PPO, zeros at the start of an episode:
 
     import numpy, onnxruntime
     session = onnxruntime.InferenceSession("ppo_crane.onnx")
@@ -44,12 +42,7 @@ class Predict(nn.Module):
 
 
 def main(policy: Positional[Path], file: Positional[Path]) -> None:
-    """Write a policy as ONNX.
-
-    Args:
-        policy: a run's folder or a policy.pt
-        file: the .onnx file to write
-    """
+    """Write the policy in a run's folder or policy.pt to an .onnx file."""
     agent, task, script = runs.load_policy(policy)
     obs_dim, buffer = len(agent.obs_mean), io.BytesIO()
     # one crane in the trace: what the trace takes for constant then fits any number

@@ -1,11 +1,4 @@
-"""Watch a crane: film trials, or drive it yourself in a window.
-
-    film(policy, "mPPO", "crane_env:ForestryCrane-v0", {}, Path("crane.mp4"), [0.3, 0.8], 10_000)
-    window(policy, "mPPO", "crane_env:ForestryCrane-v0", {})
-
-A policy has predict(obs (1, obs_dim), state, deterministic=...), which returns actions (1, 6) and
-the next state. The first state is None.
-"""
+"""Watch a crane: --video and --viewer of eval_crane.py."""
 
 import os
 import time
@@ -29,24 +22,17 @@ FPS = 20  # frames a second of a film
 
 # MuJoCo's viewer uses every letter itself. It tells us when a key goes down, not when it goes up.
 LEVERS = list("1234567890-=")  # two keys for each of the six actions: negative and positive
-KEYS = {257: "Enter", 262: "Right", 263: "Left", 264: "Down", 265: "Up", 268: "Home"}  # GLFW's
-KEYS |= {ord(key): key for key in [*LEVERS, ".", " "]}
+KEYS = {257: "Enter", 264: "Down", 265: "Up", 268: "Home"}  # GLFW's
+KEYS |= {ord(key): key for key in [*LEVERS, "."]}
 HELP = """
 .            who drives: policy or keyboard
-1 2          slew right, left
-3 4          boom down, up
-5 6          arm down, up
-7 8          telescope in, out
-9 0          rotator left, right
-- =          jaws open, close
+1 2, 3 4     slew right, left; boom down, up
+5 6, 7 8     arm down, up; telescope in, out
+9 0, - =     rotator left, right; jaws open, close
              A joint moves at full speed until you press one of its two keys again.
-Enter        next trial
-Home         this trial again
-Up Down      this trial with a thicker, thinner log
-Space        pause, go on
-Left Right   slow motion, real time
-[ ]          other cameras
-Esc          free camera: the mouse turns (left button), moves (right) and zooms (wheel) the view
+Enter, Home  next trial, this trial again
+Up, Down     this trial with a thicker, thinner log
+[ ], Esc     other cameras, free camera (mouse)
 """
 
 
@@ -96,18 +82,10 @@ def frame(crane: CraneVectorEnv, lines: dict[str, str]) -> Array:
 
 
 def film(
-    policy: Any,
-    name: str,
-    env_id: str,
-    options: dict[str, Any],
-    path: Path,
-    diameters: Sequence[float],
-    seed: int,
-    trial: int = 0,
-    camera: str = "overview",
-    width: int = 640,
-    deterministic: bool = True,
-) -> list[bool]:
+    policy: Any, name: str, env_id: str, options: dict[str, Any], path: Path,
+    diameters: Sequence[float], seed: int, trial: int = 0, camera: str = "overview",
+    width: int = 640, deterministic: bool = True,
+) -> list[bool]:  # fmt: skip
     """Film one trial per log diameter (m) into an .mp4 or .gif; which of them succeeded.
 
     Each is trial number `trial` of `evaluate` with this seed. width is in pixels.
@@ -154,15 +132,9 @@ def film(
 
 
 def window(
-    policy: Any,
-    name: str,
-    env_id: str,
-    options: dict[str, Any],
-    diameter: float = 0.5,
-    seed: int = 10_000,
-    trial: int = 0,
-    camera: str = "overview",
-) -> None:
+    policy: Any, name: str, env_id: str, options: dict[str, Any], diameter: float = 0.5,
+    seed: int = 10_000, trial: int = 0, camera: str = "overview",
+) -> None:  # fmt: skip
     """Show trials in real time until the window is closed. Keys: HELP.
 
     diameter (m), seed and trial say which trial is first. macOS needs mjpython instead of python.
@@ -181,27 +153,22 @@ def window(
     crane.viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
     crane.viewer.cam.fixedcamid = crane.model.camera(camera).id
     shown_groups = crane.viewer.opt.geomgroup.copy()
-    by_hand, paused, restart, speed, drawn_at = False, False, True, 1.0, time.time()
-    levers, failure, waited = np.zeros(6), None, 0.0
+    by_hand, restart, drawn_at, waited = False, True, time.perf_counter(), 0.0
+    levers, failure = np.zeros(6), None
 
     def watch(crane: CraneVectorEnv) -> None:
-        """Draw each time that half of 1 / FPS s have passed."""
-        nonlocal waited
+        """Each time that 1 / FPS s have passed, wait for the clock and draw."""
+        nonlocal drawn_at, waited
         waited += crane.model.opt.timestep
-        if waited > 0.5 / FPS - 1e-9:
-            draw(crane, waited)
-            waited = 0.0
-
-    def draw(crane: CraneVectorEnv, seconds: float) -> None:
-        """Draw the crane and wait until the clock has caught up."""
-        nonlocal drawn_at
+        if waited < 1 / FPS - 1e-9:
+            return
         lines = caption(crane, "keyboard" if by_hand else name, metrics, failure)
         place = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
         crane.viewer.set_texts((*place, "\n".join(lines), "\n".join(lines.values())))
         crane.viewer.opt.geomgroup[:] = shown_groups  # the viewer's keys 0 ... 5 hide some
         crane.render()
-        time.sleep(max(0.0, drawn_at + seconds / speed - time.time()))
-        drawn_at = time.time()
+        time.sleep(max(0.0, drawn_at + waited - time.perf_counter()))
+        drawn_at, waited = time.perf_counter(), 0.0
 
     crane.observers.append(watch)
     while crane.viewer.is_running():
@@ -212,10 +179,6 @@ def window(
                 levers[joint] = 0 if levers[joint] else 2 * positive - 1
             elif key == ".":
                 by_hand, state, levers = not by_hand, None, np.zeros(6)
-            elif key == " ":
-                paused = not paused
-            elif key in ("Left", "Right"):
-                speed = 0.25 if key == "Left" else 1.0
             elif key in ("Enter", "Home", "Up", "Down"):
                 restart, trial = True, trial + (key == "Enter")
                 change = {"Up": 0.1, "Down": -0.1}.get(key, 0.0)
@@ -226,8 +189,9 @@ def window(
             metrics.clear(np.array([0]))
             obs, _ = crane.reset(seed=seeds[-1:])
             restart, state, failure, levers = False, None, None, np.zeros(6)
-        if paused or failure is not None:
-            draw(crane, 0.02)
+        if failure is not None:
+            waited = 1 / FPS
+            watch(crane)
             continue
         actions = levers[None]
         if not by_hand:

@@ -56,6 +56,15 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     args = tyro.cli(arguments, default=default, description=summary, config=config)
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
+    if checkpoint:
+        if (args.num_envs, args.num_steps) != (default.num_envs, default.num_steps):
+            raise SystemExit(
+                "--resume: --num-envs and --num-steps must stay, they count the updates"
+            )
+        batch_size = args.num_envs * args.num_steps
+        done = checkpoint["iteration"] * batch_size
+        if args.total_timesteps < done + batch_size:
+            raise SystemExit(f"--resume: {done:,} steps are done; give more --total-timesteps")
     return args, checkpoint
 
 
@@ -146,16 +155,11 @@ class StopSignal:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def shown(stats: dict[str, float]) -> dict[str, str]:
-    """What stands beside the progress bar."""
-    names = {"return": "episodic_return", "success": "success_rate", "SPS": "SPS"}
-    found = {short: stats.get(f"charts/{name}") for short, name in names.items()}
-    return {short: f"{value:.3g}" for short, value in found.items() if value is not None}
-
-
-def one_line(scores: dict[str, float]) -> str:
-    """What an evaluation prints."""
-    return ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
+def brief(numbers: dict[str, float]) -> str:
+    """What the progress bar and the line of an evaluation say."""
+    named = {name.rpartition("/")[2]: number for name, number in numbers.items()}
+    shown = ("success_rate", "gentle_rate", "episodic_return", "SPS")
+    return ", ".join(f"{name} {named[name]:.3g}" for name in shown if name in named)
 
 
 def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> None:

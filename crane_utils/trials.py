@@ -155,13 +155,9 @@ def run_trials(
 
 
 def evaluate(
-    policy: Any,
-    env_id: str,
-    trials: int,
-    seed: int = EVAL_SEED,
-    threads: int = 0,
-    options: dict | None = None,
-) -> dict[str, float]:
+    policy: Any, env_id: str, trials: int, seed: int = EVAL_SEED,
+    threads: int = 0, options: dict | None = None,
+) -> dict[str, float]:  # fmt: skip
     """Mean return and success rates in trials per diameter (other tasks: trials in all).
 
     Cranes are judged on the full task: without curriculum, and without repeated starts. Rates are

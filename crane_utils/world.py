@@ -1,13 +1,13 @@
-"""What is only seen: grass, gravel, a forest's edge, stumps, bark and growth rings.
+"""What is only seen: grass, gravel, a forest's edge, bark and growth rings.
 
-`machine.load_model` calls `decorate` where something will be drawn. Nothing here collides or moves.
+`CraneVectorEnv(decorate=decorate)` adds it to the model. Nothing here collides or moves.
 """
 
 import mujoco
 import numpy as np
 from numpy import ndarray as Array
 
-TREES, STUMPS = 150, 9
+TREES = 150
 NEAREST_TREE, FARTHEST_TREE = 19.0, 48.0  # m from the crane; the overview camera is 14 m away
 
 
@@ -93,18 +93,13 @@ def decorate(spec: mujoco.MjSpec) -> None:
         mesh = spec.add_mesh(name=f"spruce_{size}", smoothnormal=False, scale=[size] * 3)
         mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
     planted = 0
-    while planted < TREES + STUMPS:
+    while planted < TREES:
         angle, turn = rng.uniform(0, 2 * np.pi, 2)
-        is_tree = planted < TREES
-        distance = rng.uniform(*((NEAREST_TREE, FARTHEST_TREE) if is_tree else (9.5, 18)))
+        distance = rng.uniform(NEAREST_TREE, FARTHEST_TREE)
         x, y, green = distance * np.cos(angle), distance * np.sin(angle), rng.uniform(0.8, 1.2)
-        if abs(y) < 5 or y < 0 and distance < 12:  # the road, and where logs lie
+        if abs(y) < 5:  # the road
             continue
         planted += 1
-        if not is_tree:
-            size = [rng.uniform(0.15, 0.3), rng.uniform(0.1, 0.25), 0]
-            world.add_geom(type=cylinder, size=size, pos=[x, y, 0.1], material="log", **seen)
-            continue
         size, rgba = rng.choice([11, 14, 17]), [0.10 * green, 0.19 * green, 0.09 * green, 1]
         quat = [np.cos(turn / 2), 0, 0, np.sin(turn / 2)]
         kind = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"spruce_{size}"}
