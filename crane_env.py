@@ -84,6 +84,7 @@ ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]  # our q1 ... q8
 SERVOS = [0, 1, 2, 3, 4, 7, 8, 9]  # the eight that have a servo
 ACTION_OF_SERVO = [0, 1, 2, 3, 3, 4, 5, 5]  # which of the six actions moves each servo
+INTEGRATORS = slice(8, 16)  # of the engine's actuators, behind the servos; your own come last
 ACTUATED = [0, 1, 2, 3, 6, 7]  # the six of our q1 ... q8 that an action moves
 
 # ---- the task
@@ -119,10 +120,7 @@ STRICT = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 @dataclass(config=STRICT)
 class Options:
-    """What can be changed about the task: keywords of `gymnasium.make`, `--env.*` of the scripts.
-
-    pydantic's ValidationError, a ValueError, names a wrong value and what is allowed.
-    """
+    """What can be changed of the task: keywords of `gymnasium.make`, `--env.*` of the scripts."""
 
     frame_skip: Annotated[int, Field(ge=1, le=1200)] = 20  # physics steps per step; the paper: 1
     contact: Literal["primitive", "sdf"] = "primitive"  # sdf: jaw meshes, the paper's solver
@@ -271,10 +269,8 @@ def staged_terms(
     closed: Array,
     grip: Array,
 ) -> dict[str, Array]:
-    """Each term pays for one stage, and more than the one before, (N,) each.
-
-    r_grapple pays for jaws that close near the log's centre, r_lift for a log that rises there, and
-    r_balance for a crane that holds still while both jaws hold the lifted log.
+    """r_grapple pays for jaws that close near the log's centre, r_lift for a log that rises there,
+    r_balance for a crane that holds still while both jaws hold the lifted log, (N,) each.
 
     distance (N,) in m is ||Delta_p|| + 1 m Delta_psi, with Delta_p 0 where the grapple is
     CLOSING_HEIGHT higher. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
@@ -330,6 +326,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     TIME_LIMIT = 9.0  # s, of an episode (paper, Tables I and II)
     REACH_TIME = 6.0  # s, by which the log must have been reached (paper)
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
+    GOALS: tuple[str, ...] = ()  # rules that end an episode well, if `conditions` have held
     PIECE = 5  # physics steps between two clamps of the integrators (assets/README.md)
     # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
@@ -376,18 +373,18 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         for field in ("geom_size", "body_mass", "body_inertia"):
             batch.expand(field)  # each crane has a log of its own
         # live views of the engine's arrays, one row a crane
-        self.qpos, self.qvel, self.act = batch.bind("qpos"), batch.bind("qvel"), batch.bind("act")
-        self.ctrl, self.qfrc_bias = batch.bind("ctrl"), batch.bind("qfrc_bias")
+        self.qpos, self.qvel, self.ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+        self.act, self.qfrc_bias = batch.bind("act")[:, :8], batch.bind("qfrc_bias")
         self.sensordata = batch.bind("sensordata")
         # history ends with ground_force, the only sensor that has one: x, y, z of the last steps
         self.ground_force = batch.bind("history")[:, -3 * self.PIECE :]
         self.joint_range = model.jnt_range[JOINTS]  # (8, 2), rad and m
-        _, integrators = np.split(model.actuator_gainprm, 2)
-        self.servo_kp = np.tile(integrators[:, 0], (num_envs, 1))
+        self.servo_kp = np.tile(model.actuator_gainprm[INTEGRATORS, 0], (num_envs, 1))
         # N m and N, lowest and highest that each servo may push with, (2, N, 8)
         self.force_limit = np.tile(model.jnt_actfrcrange[SERVOS].T[:, None], (1, num_envs, 1))
 
-        self.rngs, self.starts = None, [()] * num_envs  # three generators and a start each
+        self.rngs: list[tuple[Generator, Generator, Generator]] | None = None
+        self.starts: list[tuple] = [()] * num_envs
         self.density = np.full(num_envs, LOG_DENSITY)  # kg/m^3
         self.command = np.zeros((num_envs, 6))  # rad/s, m/s
         self.steps = np.zeros(num_envs, int)  # since the start of each episode
@@ -430,22 +427,22 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         state, time = self.state(), self.steps * self.dt
 
         # observe
-        obs = self.observation(state)
+        obs = self.bounded_observation(state)
+        obs[diverged] = 0.0
 
         # measure
-        info = self.measure(state) | {"time": time}
+        info = self.measure(state) | {"time": time, "diverged": diverged}
         reached = self.reached(info) & (time < self.REACH_TIME + 1e-9)
         self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
         info["time_to_reach"] = self.reach_time.copy()
         terms = self.reward_terms(state, info)
-        terms = {name: np.where(np.isnan(term), 0.0, term) for name, term in terms.items()}
+        terms = {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
         info |= terms
-        reward = np.where(diverged, 0.0, sum(terms.values()))
+        reward = sum(terms.values())
 
         # rules
-        rules = self.rules(state, diverged)
-        late = time > self.TIME_LIMIT - 1e-9
-        ending = np.select([*rules.values(), late], [*rules, "time_limit"], default="none")
+        rules = self.rules(state, info) | {"time_limit": time > self.TIME_LIMIT - 1e-9}
+        ending = np.select([*rules.values()], [*rules], default="none")
         done, truncated = ending != "none", ending == "time_limit"
         terminated = done & ~truncated
 
@@ -454,7 +451,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
         held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
         info["safe"] = np.all([*held.values()], axis=0)
-        success = truncated & info["safe"]
+        success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
         gentle = success & (self.ground_peak <= GENTLE_FORCE)
         failure = np.select([~ok for ok in held.values()], [*held], default="")
         failure = np.where(terminated, ending, failure)
@@ -477,31 +474,29 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 info["final_obs"][i] = obs[i].copy()
             info["_final_obs"] = info["_final_info"] = done
             self.start_episodes(np.flatnonzero(done))
-            obs[done] = self.observation(self.state())[done]
+            obs[done] = self.bounded_observation(self.state())[done]
         if self.render_mode == "human":
             self.render()
         return obs, reward, terminated, truncated, info
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
-        super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is not None or self.rngs is None:
             if np.ndim(seed) == 0:  # one, or None
                 seed = SeedSequence(seed).spawn(self.num_envs)
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
-            # Starts, pose noise and what a subclass draws have streams of their own, so that one
-            # leaves the others alone.
+            # Starts, pose noise and what a subclass draws have streams of their own. Not of
+            # s.spawn(3): it counts, and a seed that is given twice would start other episodes.
             streams = [(s, s.generate_state(4), s.generate_state(8)[4:]) for s in seeds]
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
             self.recent_success = [deque(maxlen=10) for _ in seeds]  # a crane's last episodes
         self.start_episodes(np.arange(self.num_envs))
-        state = self.state()
-        info = self.measure(state)
+        info = self.measure(state := self.state())
         masks = {f"_{key}": np.ones(self.num_envs, bool) for key in info}
-        return self.observation(state), info | masks
+        return self.bounded_observation(state), info | masks
 
     # ---- hooks: the model, the start of an episode
 
@@ -538,8 +533,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if not 0 <= self.difficulty <= 1:
             raise ValueError(f"difficulty must be in [0, 1], got {self.difficulty}")
         (start_rng, noise_rng, _), failures = self.rngs[i], self.failures[i]
-        retry = self.retry * np.mean(self.recent_success[i] or 0.0)  # 0 at first
-        if retry and failures and start_rng.random() < retry:
+        share = self.retry * np.mean(self.recent_success[i] or 0.0)  # 0 at first
+        if share and failures and start_rng.random() < share:
             self.starts[i] = failures[start_rng.integers(len(failures))]
         else:
             self.starts[i] = sample_start(start_rng)
@@ -572,7 +567,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             streak[ids] = 0
 
     def set_constants(self, ids: Array, radius: Array) -> None:
-        """Write to the engine what differs between episodes: the log of radius (n,), in m."""
+        """Write to the engine what differs between episodes: the log of radius (n,), in m.
+
+        Poses of your own bodies belong here, too: positions are computed after it.
+        """
         mass = self.density[ids] * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
         log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
@@ -592,14 +590,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # than a piece, only every k-th step of an episode begins a piece.
         every = max(1, self.PIECE // self.frame_skip)
         due = self.steps % every == 0
-        for start in range(0, self.frame_skip, self.PIECE):
-            nstep = min(self.PIECE, self.frame_skip - start)
+        left = self.frame_skip  # physics steps to go
+        while left:
+            nstep = min(self.PIECE, left)
             self.drive(np.flatnonzero(due), nstep * every * self.model.opt.timestep)
             low, high = self.qpos[:, SERVOS] + self.force_limit / self.servo_kp
             np.clip(self.act, low, high, out=self.act, where=due[:, None])
+            self.ground_force[:] = 0.0  # a hit of an earlier piece is not this one's
             for size in [1] * nstep if self.observers else [nstep]:
-                start += size  # sensors are needed after the last physics step only
-                stage = VEL if start == self.frame_skip else mujoco.mjtStage.mjSTAGE_NONE
+                left -= size  # sensors are needed after the last physics step only
+                stage = mujoco.mjtStage.mjSTAGE_NONE if left else VEL
                 try:
                     self.batch.step(nstep=size, stage=stage)
                 except SimulationError as error:
@@ -618,8 +618,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return self.batch.warning[:, :, 1].any(axis=-1)
 
     def drive(self, ids: Array, seconds: float) -> None:
-        """Set `ctrl` of cranes `ids` for the next seconds: that of servos and their integrators."""
-        self.ctrl[:] = np.tile(self.command[:, ACTION_OF_SERVO], 2)
+        """Set `ctrl` of cranes `ids`, in which a piece begins, for the next seconds."""
+        # of all cranes: ideal servos and their integrators answer at every step
+        self.ctrl[:, :16] = np.tile(self.command[:, ACTION_OF_SERVO], 2)
 
     # ---- hooks: what is observed, measured, rewarded, and what ends an episode
 
@@ -629,17 +630,16 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # as in crane.xml; sensors of your own go behind the crane's force on the ground
         parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17, 20], axis=1)
         *poses, touch, support, pressure, _ = parts
-        weight = -self.model.opt.gravity[2] * self.batch.body("log").mass[:, 0]
+        weight = np.linalg.norm(self.model.opt.gravity) * self.batch.body("log").mass[:, 0]
         ground = np.linalg.norm(support, axis=-1) + np.linalg.norm(pressure, axis=-1)
         carried = np.clip(1 - ground / weight, 0, 1)
         diameter = 2 * self.batch.geom("log").size[:, 0]
         return CraneState(q, dq, *poses, touch > 0, diameter, carried)
 
-    def observation(self, state: CraneState) -> Array:
-        """`observe` as float32 (N, n) within the space, 0 for what diverged."""
+    def bounded_observation(self, state: CraneState) -> Array:
+        """`observe` as float32 (N, n) within the space."""
         space = self.single_observation_space
-        obs = np.nan_to_num(self.observe(state), nan=0.0, posinf=np.inf, neginf=-np.inf)
-        return np.clip(obs, space.low, space.high).astype(np.float32, order="C")
+        return np.clip(self.observe(state), space.low, space.high).astype(np.float32, order="C")
 
     def observation_limits(self) -> Array:
         """Lowest and highest value of each number of `observe`, (2, n)."""
@@ -694,19 +694,19 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """closed and grip of `staged_terms`."""
         return state.q[:, 7] / Q8_MAX, centred(miss)
 
-    def rules(self, state: CraneState, diverged: Array) -> dict[str, Array]:
+    def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """What ends an episode early (Sec. IV-B3), (N,) bool each, by name. The first counts."""
         q, (low, high) = state.q, self.joint_range.T
         beyond = (q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE)
         away = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
-        late = self.steps * self.dt > self.REACH_TIME - 1e-9
+        too_late = info["time"] > self.REACH_TIME - 1e-9
         return {
-            "diverged": diverged,
+            "diverged": info["diverged"],
             # not q8: the jaws' end stops are part of grasping
             **{f"joint_limit_q{k + 1}": beyond[:, k] for k in range(7)},
             "overspeed": (np.abs(state.dq) > 2 * speed_limit(state.dq)).any(axis=-1),
             "log_too_far": away > LOG_RANGE,
-            "not_reached": late & np.isinf(self.reach_time),
+            "not_reached": too_late & np.isinf(self.reach_time),
         }
 
     def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
@@ -777,7 +777,7 @@ class CraneEnv(gymnasium.Env):
 
     def of_one(self, info: dict[str, Array]) -> dict[str, Any]:
         """The one crane's info, in Python's numbers, bools and strings."""
-        one = {key: value[0] for key, value in info.items() if not key.startswith("_")}
+        one = {key: value[0] for key, value in info.items() if key[0] != "_"}
         return {key: value.item() if np.ndim(value) == 0 else value for key, value in one.items()}
 
     def render(self) -> Array | None:
@@ -788,13 +788,13 @@ class CraneEnv(gymnasium.Env):
         self.envs.close()
 
 
-ONE, MANY = "crane_env:CraneEnv", "crane_env:CraneVectorEnv"
 PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
 PAPER |= {"signed_yaw": False, "axes": "world"}
+ONE, MANY = "crane_env:CraneEnv", "crane_env:CraneVectorEnv"
 gymnasium.register("ForestryCrane-v0", ONE, vector_entry_point=MANY)
 gymnasium.register("ForestryCranePaper-v0", ONE, vector_entry_point=MANY, kwargs=PAPER)
-# beyond the paper: hydraulic_crane.py
+# beyond the paper
 ONE, MANY = "hydraulic_crane:HydraulicCraneEnv", "hydraulic_crane:HydraulicCraneVectorEnv"
 gymnasium.register("ForestryCraneHydraulic-v0", ONE, vector_entry_point=MANY)
-DRAWN = {"randomize": 1.0}
-gymnasium.register("ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs=DRAWN)
+RANDOM = {"randomize": 1.0}
+gymnasium.register("ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs=RANDOM)

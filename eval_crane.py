@@ -215,12 +215,15 @@ def print_table(lines: dict[str, dict]) -> None:
 
 def main() -> None:
     sys.path.insert(0, os.getcwd())  # where the user's policies and tasks are
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # `2>&-` closes it
     summary, _, usage = __doc__.partition("\n\n")
     args, flags = tyro.cli(
         Args,
         description=summary + " --env.NAME changes an option of the task, as in the training.",
         return_unknown_args=True,
     )
+    if args.csv and (args.video or args.viewer):
+        raise SystemExit("--csv has a row for each evaluated trial: leave out --video and --viewer")
     torch.set_num_threads(1)  # the batches are too small for more
     evaluated = []
     for name in args.policies:  # all errors before the first trial
@@ -244,7 +247,10 @@ def main() -> None:
             if file:
                 csv.DictWriter(file, ["policy", *row]).writerow({"policy": name, **row})
             rows.append(row)
-        papers_task = env_id.partition("-")[0] in ("ForestryCrane", "ForestryCranePaper")
+        papers_task = env_id.rpartition(":")[2].partition("-")[0] in (
+            "ForestryCrane",
+            "ForestryCranePaper",
+        )
         published = PAPER.get(options.pose_noise, {}) if papers_task else {}
         table = {
             f"{d} m": summarize([row for row in rows if row["diameter"] == d], published)

@@ -28,17 +28,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 import crane_env
-from crane_env import (
-    ACTION_OF_SERVO,
-    JAW_LENGTH,
-    JOINTS,
-    PIVOT_HEIGHT,
-    SERVOS,
-    STRICT,
-    CraneState,
-    centred,
-    speed_limit,
-)
+from crane_env import ACTION_OF_SERVO, INTEGRATORS, SERVOS, CraneState, centred, speed_limit
 
 # ---- the drives; six numbers belong to q1, q2, q3, each telescope stage, q7 and q8
 
@@ -82,7 +72,7 @@ DRAWN = {
 EMPTY_GRIP = 0.5  # share of r_grapple for closed jaws without a log; a grip earns all
 
 
-@dataclass(config=STRICT)
+@dataclass(config=crane_env.STRICT)
 class Options(crane_env.Options):
     """Options of the hydraulic crane."""
 
@@ -117,15 +107,15 @@ def cylinder_levers(q2: Array, q3: Array) -> Array:
     return np.maximum(levers, MIN_LEVER)
 
 
-def oil_per_movement(q: Array, dq: Array, force: Array) -> Array:
-    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), at q (N, ...), moving as dq (N, 6).
+def oil_per_movement(levers: Array, dq: Array, force: Array) -> Array:
+    """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), moving as dq (N, 6).
 
     The same number times a pressure in Pa is the torque or force in that direction, in N m and N.
     force (N, 6) is that of the drives: a telescope that needs more than the rod side leaves it runs
     on its full area, and takes that oil.
     """
     oil = np.where(dq < 0, OIL[0], OIL[1])
-    oil[:, 1:3] *= cylinder_levers(q[:, 1], q[:, 2]).T
+    oil[:, 1:3] *= levers.T  # of `cylinder_levers`
     loaded = (dq[:, 3] >= 0) & (force[:, 3] > PRESSURE * OIL[1, 3])
     oil[loaded, 3] = FULL_TELESCOPE
     return oil
@@ -136,7 +126,11 @@ def grip_depth(state: CraneState) -> Array:
 
     Jaws that pinch a log above its centre squeeze it out.
     """
-    tips = state.grapple_centre[:, 2] + PIVOT_HEIGHT - JAW_LENGTH * np.sin(state.q[:, 7])
+    tips = (
+        state.grapple_centre[:, 2]
+        + crane_env.PIVOT_HEIGHT
+        - crane_env.JAW_LENGTH * np.sin(state.q[:, 7])
+    )
     return (state.log_centre[:, 2] - tips) / (state.diameter / 2)
 
 
@@ -159,6 +153,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         }
         self.valve_speed = np.zeros((num_envs, 6))  # rad/s, m/s, that the valves let through
         self.telescope_wait = np.zeros(num_envs)  # s since a resting telescope was commanded
+        self.levers = np.zeros((2, num_envs))  # m/rad, of boom and arm cylinder
 
     # ---- the model and the start of an episode
 
@@ -191,8 +186,9 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         return q + swing, log_pose, diameter
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
-        self.valve_speed[ids] = self.telescope_wait[ids] = 0
         super().place(ids, q, log_pose, diameter)
+        self.valve_speed[ids] = self.telescope_wait[ids] = 0
+        self.limit_forces(ids)
 
     def set_constants(self, ids: Array, radius: Array) -> None:
         """Also give the engine what was drawn."""
@@ -201,9 +197,10 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         self.density[ids] = drawn["density"]
         super().set_constants(ids, radius)
         self.servo_kp[ids] = stiffness = drawn["stiffness"][:, ACTION_OF_SERVO]
-        engine["actuator_gainprm"][ids, 8:, 0] = stiffness
-        engine["actuator_biasprm"][ids, 8:, 1] = -stiffness
-        engine["actuator_delay"][ids, 8:] = model.actuator_delay[8:] + drawn["extra_delay"][:, None]
+        engine["actuator_gainprm"][ids, INTEGRATORS, 0] = stiffness
+        engine["actuator_biasprm"][ids, INTEGRATORS, 1] = -stiffness
+        delay = model.actuator_delay[INTEGRATORS] + drawn["extra_delay"][:, None]
+        engine["actuator_delay"][ids, INTEGRATORS] = delay
         engine["dof_damping"][np.ix_(ids, SERVOS)] = drawn["damping"][:, ACTION_OF_SERVO]
         engine["geom_friction"][ids] = model.geom_friction * drawn["friction"][:, None, None]
 
@@ -214,17 +211,18 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         command, gain = self.command[ids], self.drawn["gain"][ids]
         self.limit_forces(ids)
         wanted = np.where(command < 0, gain[:, 0], gain[:, 1]) * command
-        self.ctrl[ids, 8:] = self.oil_speed(ids, wanted, seconds)[:, ACTION_OF_SERVO]
+        self.ctrl[ids, INTEGRATORS] = self.oil_speed(ids, wanted, seconds)[:, ACTION_OF_SERVO]
 
     def limit_forces(self, ids: Array) -> None:
         """No drive of cranes `ids` pushes harder than PRESSURE allows where its joint is now."""
-        q, way = self.qpos[ids], np.ones((len(ids), 6))
+        self.levers[:, ids] = levers = cylinder_levers(*self.qpos[ids, 1:3].T)
+        way = np.ones((len(ids), 6))
         heavy = np.inf * way  # the telescope may use its full area
-        areas = np.array([oil_per_movement(q, -way, heavy), oil_per_movement(q, way, heavy)])
-        most = (PRESSURE * areas / SERVOS_OF_ACTION)[:, :, ACTION_OF_SERVO]
+        areas = [oil_per_movement(levers, sign * way, heavy) for sign in (-1, 1)]
+        most = (PRESSURE * np.array(areas) / SERVOS_OF_ACTION)[:, :, ACTION_OF_SERVO]
         most = np.minimum(most, self.model.jnt_actfrcrange[SERVOS, 1])
         self.force_limit[:, ids] = low, high = -most[0], most[1]
-        self.engine["actuator_forcerange"][ids, 8:] = np.stack([low, high], axis=-1)
+        self.engine["actuator_forcerange"][ids, INTEGRATORS] = np.stack([low, high], axis=-1)
 
     def spring_force(self) -> Array:
         """Force of the oil on each servo's joint, (N, 8), N m and N."""
@@ -247,7 +245,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         mean = target + (speed - target) * LAG / seconds * (1 - decay)
         self.valve_speed[ids] = target + (speed - target) * decay
         force = self.spring_force()[ids] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
-        oil = oil_per_movement(self.qpos[ids], mean, force)
+        oil = oil_per_movement(self.levers[:, ids], mean, force)
         demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
         return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
 
@@ -273,7 +271,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         if not self.options.sensors:
             return obs
         last_command = self.command / speed_limit(self.command)
-        rates = self.qvel[:, JOINTS][:, PASSIVE]
+        rates = self.qvel[:, crane_env.JOINTS][:, PASSIVE]
         force = (self.spring_force() / self.model.jnt_actfrcrange[SERVOS, 1])[:, FIRST_SERVO]
         return np.concatenate([obs, last_command, rates, force], axis=-1)
 

@@ -115,8 +115,8 @@ class Agent(nn.Module):
         self.actor = mlp([obs_dim, *args.hidden_sizes, 2 * len(action_low)], std=0.01)
         nn.init.constant_(self.actor[-1].bias, args.log_excess_init)
         self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float64))
-        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float64))
+        self.register_buffer("action_low", torch.as_tensor(action_low))
+        self.register_buffer("action_high", torch.as_tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
@@ -145,8 +145,9 @@ class Agent(nn.Module):
         return Beta(alpha, beta, validate_args=False)
 
     def to_env(self, actions: Tensor) -> np.ndarray:
-        """Actions in the environment's units, from a_n."""
-        return torch.lerp(self.action_low, self.action_high, actions.double()).cpu().numpy()
+        """Actions in the environment's units and dtype, from a_n."""
+        low, high = self.action_low.double(), self.action_high.double()
+        return torch.lerp(low, high, actions.double()).to(self.action_low.dtype).cpu().numpy()
 
     @torch.no_grad()
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
@@ -209,10 +210,9 @@ if __name__ == "__main__":
     todo = range(first_iteration, num_iterations + 1)
     for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
         # Schedules
-        progress = (iteration - 1.0) / num_iterations
-        left = 1.0 - progress
+        left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
-        epsilon = args.perturbation * max(0.0, 1 - progress / args.perturbed)
+        epsilon = args.perturbation * max(0.0, 1 - (1 - left) / args.perturbed)
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = 1 - (1 - args.gamma) / growth
         reward_scale = args.reward_scale / growth  # V keeps its size as the horizon grows
@@ -296,19 +296,19 @@ if __name__ == "__main__":
         for name, value in stats.items():
             writer.add_scalar(name, value, global_step)
 
-        # Save
-        final = iteration == num_iterations
-        if iteration % 10 == 0 or final or stop.received:
-            runs.save(folder, args, envs, agent, optimizer, iteration)
-        if stop.received:
-            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
-
         # Evaluate
-        if iteration % args.eval_every == 0 or final:
+        final = iteration == num_iterations
+        if final or (iteration % args.eval_every == 0 and not stop.received):
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
+
+        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        if final or iteration % 10 == 0 or stop.received:
+            runs.save(folder, args, envs, agent, optimizer, iteration)
+        if stop.received and not final:
+            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
         bar.set_postfix_str(runs.brief(stats))
     writer.close()

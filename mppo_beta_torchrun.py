@@ -103,8 +103,8 @@ class Agent(nn.Module):
         self.actor = mlp([obs_dim, *args.hidden_sizes, 2 * len(action_low)], std=0.01)
         nn.init.constant_(self.actor[-1].bias, args.log_excess_init)
         self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float64))
-        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float64))
+        self.register_buffer("action_low", torch.as_tensor(action_low))
+        self.register_buffer("action_high", torch.as_tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
@@ -133,8 +133,9 @@ class Agent(nn.Module):
         return Beta(alpha, beta, validate_args=False)
 
     def to_env(self, actions: Tensor) -> np.ndarray:
-        """Actions in the environment's units, from a_n."""
-        return torch.lerp(self.action_low, self.action_high, actions.double()).cpu().numpy()
+        """Actions in the environment's units and dtype, from a_n."""
+        low, high = self.action_low.double(), self.action_high.double()
+        return torch.lerp(low, high, actions.double()).to(self.action_low.dtype).cpu().numpy()
 
     @torch.no_grad()
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
@@ -221,10 +222,9 @@ if __name__ == "__main__":
     count = {"initial": first_iteration - 1, "total": num_iterations, "disable": rank > 0}
     for iteration in (bar := tqdm(todo, **count)):
         # Schedules
-        progress = (iteration - 1.0) / num_iterations
-        left = 1.0 - progress
+        left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
-        epsilon = args.perturbation * max(0.0, 1 - progress / args.perturbed)
+        epsilon = args.perturbation * max(0.0, 1 - (1 - left) / args.perturbed)
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = 1 - (1 - args.gamma) / growth
         reward_scale = args.reward_scale / growth  # V keeps its size as the horizon grows
@@ -257,10 +257,10 @@ if __name__ == "__main__":
         torch.set_num_threads(args.threads)
         b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
         with torch.no_grad():
-            agent.update_normalizer(torch.cat(raw_obs))  # no rank waits for others in a rollout
             values = agent.get_value(b_obs).view_as(rewards)
             b_logprobs = agent.get_distribution(b_obs).log_prob(b_actions).sum(-1)
             next_value = agent.get_value(agent.normalize(next_obs))
+            agent.update_normalizer(torch.cat(raw_obs))  # no rank waits for others in a rollout
         advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda)
         b_advantages, b_returns = advantages.flatten(), (advantages + values).flatten()
 
@@ -312,23 +312,23 @@ if __name__ == "__main__":
         for name, value in stats.items() if rank == 0 else ():
             writer.add_scalar(name, value, global_step)
 
-        # Save
+        # Evaluate
         final = iteration == num_iterations
         stopping = average(torch.tensor(float(bool(stop.received)), device=device)) > 0  # any rank
-        if rank == 0 and (iteration % 10 == 0 or final or stopping):
-            runs.save(folder, all_args, envs, agent, optimizer, iteration)
-        if stopping and rank > 0:
-            break
-        if stopping:
-            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
-
-        # Evaluate
-        if rank == 0 and (iteration % args.eval_every == 0 or final):
+        if rank == 0 and (final or (iteration % args.eval_every == 0 and not stopping)):
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
+
+        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        if rank == 0 and (final or iteration % 10 == 0 or stopping):
+            runs.save(folder, all_args, envs, agent, optimizer, iteration)
+        if stopping and not final and rank == 0:
+            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
+        if stopping:
+            break
         bar.set_postfix_str(runs.brief(stats))
     if rank == 0:
         writer.close()

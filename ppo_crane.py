@@ -82,7 +82,7 @@ class Args:
     curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
     retry: Share = 0.25  # largest share of episodes that repeat a failed start
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
-    narrowing: float = 1.25  # fall of log sigma in the run; the gradient moves it as well
+    narrowing: float = 1.25  # fall of log sigma in the run
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -106,8 +106,8 @@ class Agent(nn.Module):
         self.actor = mlp([obs_dim, *args.hidden_sizes, len(action_low)], std=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
         self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float64))
-        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float64))
+        self.register_buffer("action_low", torch.as_tensor(action_low))
+        self.register_buffer("action_high", torch.as_tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
@@ -136,9 +136,9 @@ class Agent(nn.Module):
 
     def to_env(self, actions: Tensor) -> np.ndarray:
         """Actions in the environment's units: -1 and 1 become the limits, if there are any."""
-        low, high = self.action_low, self.action_high
+        low, high = self.action_low.double(), self.action_high.double()
         scaled = torch.where(high - low < 1e9, (low + high + (high - low) * actions) / 2, actions)
-        return scaled.clamp(low, high).cpu().numpy()
+        return scaled.clamp(low, high).to(self.action_low.dtype).cpu().numpy()
 
     @torch.no_grad()
     def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
@@ -281,19 +281,19 @@ if __name__ == "__main__":
         for name, value in stats.items():
             writer.add_scalar(name, value, global_step)
 
-        # Save
-        final = iteration == num_iterations
-        if iteration % 10 == 0 or final or stop.received:
-            runs.save(folder, args, envs, agent, optimizer, iteration)
-        if stop.received:
-            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
-
         # Evaluate
-        if iteration % args.eval_every == 0 or final:
+        final = iteration == num_iterations
+        if final or (iteration % args.eval_every == 0 and not stop.received):
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
+
+        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        if final or iteration % 10 == 0 or stop.received:
+            runs.save(folder, args, envs, agent, optimizer, iteration)
+        if stop.received and not final:
+            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
         bar.set_postfix_str(runs.brief(stats))
     writer.close()

@@ -82,7 +82,7 @@ class Args:
     curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
     retry: Share = 0.0  # largest share of episodes that repeat a failed start
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
-    narrowing: float = 1.25  # fall of log sigma in the run; the gradient moves it as well
+    narrowing: float = 1.25  # fall of log sigma in the run
 
 
 def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
@@ -108,8 +108,8 @@ class Agent(nn.Module):
         self.actor = mlp([features, *args.hidden_sizes, len(action_low)], std=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
         self.critic = mlp([features, *args.hidden_sizes, 1], std=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low, dtype=torch.float64))
-        self.register_buffer("action_high", torch.as_tensor(action_high, dtype=torch.float64))
+        self.register_buffer("action_low", torch.as_tensor(action_low))
+        self.register_buffer("action_high", torch.as_tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
@@ -129,7 +129,6 @@ class Agent(nn.Module):
         return ((obs - self.obs_mean) / torch.sqrt(self.obs_var + 1e-8)).float().clamp(-10, 10)
 
     def initial_state(self, num_envs: int) -> State:
-        """Empty memories of num_envs cranes."""
         h, c = torch.zeros((2, num_envs, self.lstm.hidden_size), device=self.obs_mean.device)
         return h, c
 
@@ -159,16 +158,15 @@ class Agent(nn.Module):
 
     def to_env(self, actions: Tensor) -> np.ndarray:
         """Actions in the environment's units: -1 and 1 become the limits, if there are any."""
-        low, high = self.action_low, self.action_high
+        low, high = self.action_low.double(), self.action_high.double()
         scaled = torch.where(high - low < 1e9, (low + high + (high - low) * actions) / 2, actions)
-        return scaled.clamp(low, high).cpu().numpy()
+        return scaled.clamp(low, high).to(self.action_low.dtype).cpu().numpy()
 
     @torch.no_grad()
-    def predict(self, obs: np.ndarray, state: State = None, deterministic: bool = True) -> tuple:
-        """Actions (B, act_dim) for raw obs (B, obs_dim), and the state of the memory after them.
-
-        Where an episode begins, the state must be None, or zeros in the row of its crane.
-        """
+    def predict(
+        self, obs: np.ndarray, state: State | None = None, deterministic: bool = True
+    ) -> tuple:
+        """Actions (B, act_dim) for raw obs (B, obs_dim), and the memory; None where all begin."""
         obs = torch.as_tensor(obs, dtype=torch.float64, device=self.obs_mean.device)
         state = self.initial_state(len(obs)) if state is None else state
         no_starts = torch.zeros(1, len(obs), device=obs.device)
@@ -204,7 +202,8 @@ if __name__ == "__main__":
         return min(1.0, iteration / num_iterations / max(args.curriculum, 1e-9))
 
     # Environments
-    assert args.num_envs % args.num_minibatches == 0, "--num-minibatches must divide --num-envs"
+    if args.num_envs % args.num_minibatches:
+        raise SystemExit("--num-minibatches must divide --num-envs")
     evaluation = {"threads": args.threads, "options": asdict(args.env)}
     envs = trials.make_envs(args.env_id, args.num_envs, **evaluation, retry=args.retry)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -259,7 +258,8 @@ if __name__ == "__main__":
                 no_starts = torch.zeros(1, cut.sum(), device=device)
                 with torch.no_grad():
                     final_obs = agent.normalize(final_obs)[None]
-                    features, _ = agent.remember(final_obs, [s[cut] for s in state], no_starts)
+                    cut_state = state[0][cut], state[1][cut]
+                    features, _ = agent.remember(final_obs, cut_state, no_starts)
                     rewards[step, cut] += gamma * agent.get_value(features[0])
 
         # Advantages. The policy was frozen in the rollout: values and log-probabilities of all its
@@ -322,19 +322,19 @@ if __name__ == "__main__":
         for name, value in stats.items():
             writer.add_scalar(name, value, global_step)
 
-        # Save
-        final = iteration == num_iterations
-        if iteration % 10 == 0 or final or stop.received:
-            runs.save(folder, args, envs, agent, optimizer, iteration)
-        if stop.received:
-            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
-
         # Evaluate
-        if iteration % args.eval_every == 0 or final:
+        final = iteration == num_iterations
+        if final or (iteration % args.eval_every == 0 and not stop.received):
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
+
+        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        if final or iteration % 10 == 0 or stop.received:
+            runs.save(folder, args, envs, agent, optimizer, iteration)
+        if stop.received and not final:
+            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
         bar.set_postfix_str(runs.brief(stats))
     writer.close()

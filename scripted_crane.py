@@ -158,7 +158,7 @@ def bounded(vector: np.ndarray, length: float) -> np.ndarray:
 class ScriptedCrane:
     """Maps observations (N, 18 or more) of ForestryCrane-v0 to actions (N, 6).
 
-    settings: None takes IDEAL, or HYDRAULIC for the 32 numbers that such drives observe.
+    settings: None takes HYDRAULIC for 32 or more numbers, as such drives have them, else IDEAL.
     """
 
     signed_yaw = True  # False finds the sign of Delta_psi by turning

@@ -45,7 +45,7 @@ def main(policy: Positional[Path], file: Positional[Path]) -> None:
     """Write the policy in a run's folder or policy.pt to an .onnx file."""
     agent, task, script = runs.load_policy(policy)
     obs_dim, buffer = len(agent.obs_mean), io.BytesIO()
-    # one crane in the trace: what the trace takes for constant then fits any number
+    # with one crane in the trace, what it takes for constant fits any number
     state = agent.initial_state(1) if hasattr(agent, "initial_state") else ()
     inputs = ["obs", "h", "c"][: 1 + len(state)]
     outputs = ["actions", "h_next", "c_next"][: 1 + len(state)]

@@ -36,13 +36,8 @@ Up, Down     this trial with a thicker, thinner log
 """
 
 
-def caption(
-    crane: CraneVectorEnv, driver: str, metrics: Metrics, failure: str | None = None
-) -> dict[str, str]:
-    """What a film and the window say of crane 0.
-
-    failure is that of the info of a trial's last step, None before: "" says that it succeeded.
-    """
+def caption(crane: CraneVectorEnv, driver: str, metrics: Metrics, failure: str | None) -> dict:
+    """What a film and the window say of crane 0; failure is that of `info`, None before the end."""
     state = crane.state()
     if failure is not None:
         phase = f"failed: {failure}".replace("_", " ") if failure else "success"
@@ -106,7 +101,7 @@ def film(
         waited += crane.model.opt.timestep
         if waited > 1 / FPS - 1e-9:
             waited -= 1 / FPS
-            video.append_data(frame(crane, caption(crane, name, metrics)))
+            video.append_data(frame(crane, caption(crane, name, metrics, None)))
             bar.update()
 
     crane.observers.append(shoot)

@@ -1,8 +1,4 @@
-"""What an episode costs: oil, energy, swing and time, observed after each physics step.
-
-metrics = Metrics(envs.unwrapped)  # before the first step
-results = run_trials(policy, envs, seeds, metrics=metrics)
-"""
+"""What an episode costs: oil, energy, swing and time, observed after each physics step."""
 
 from typing import Any
 
@@ -10,7 +6,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from crane_env import ACTION_OF_SERVO, ACTUATED, JOINTS, SERVOS, SPEED_LIMITS, CraneVectorEnv
-from hydraulic_crane import oil_per_movement
+from hydraulic_crane import cylinder_levers, oil_per_movement
 
 MOVING = 0.01  # share of its speed limit below which a joint only trembles
 
@@ -42,7 +38,7 @@ class Metrics:
         q, dq = envs.qpos[:, JOINTS], envs.qvel[:, JOINTS][:, ACTUATED]
         dq = dq * ~envs.warned()[:, None]  # the engine has reset those
         force = self.drive_force[:, SERVOS] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
-        oil = oil_per_movement(q, dq, force)
+        oil = oil_per_movement(cylinder_levers(q[:, 1], q[:, 2]), dq, force)
         flow = np.sum(oil * np.abs(dq), axis=-1)
         moving = np.abs(dq) > MOVING * np.minimum(*np.abs(SPEED_LIMITS))
         pressure = np.max(np.maximum(force * np.sign(dq) / oil, 0) * moving, axis=-1)

@@ -5,6 +5,7 @@ act with, checkpoint.pt to resume from, and a copy of the script that wrote them
 """
 
 import argparse
+import contextlib
 import importlib.util
 import os
 import shutil
@@ -13,6 +14,7 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
+from secrets import token_hex
 from types import FrameType
 from typing import Annotated, Any
 
@@ -38,12 +40,15 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     The defaults of --env.* are those of the task that --env-id names, or of the resumed run.
     """
     sys.path.insert(0, os.getcwd())  # where the user's own tasks are
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # `2>&-` closes it
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     scan.add_argument("--env-id", "--env_id", default=arguments.env_id)
     scan.add_argument("--resume", type=Path)
     seen, _ = scan.parse_known_args()
     checkpoint = None
     if seen.resume:
+        if not (seen.resume / "checkpoint.pt").is_file():
+            raise SystemExit(f"--resume: no checkpoint.pt in {seen.resume}")
         checkpoint = load(seen.resume / "checkpoint.pt")
         if checkpoint["script"] != (script := Path(sys.argv[0]).name):
             raise SystemExit(f"--resume: {checkpoint['script']} wrote {seen.resume}, not {script}")
@@ -57,10 +62,9 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     if checkpoint:
-        if (args.num_envs, args.num_steps) != (default.num_envs, default.num_steps):
-            raise SystemExit(
-                "--resume: --num-envs and --num-steps must stay, they count the updates"
-            )
+        for name in ("env_id", "num_envs", "num_steps"):  # the task, and what counts the updates
+            if getattr(args, name) != (was := getattr(default, name)):
+                raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
         batch_size = args.num_envs * args.num_steps
         done = checkpoint["iteration"] * batch_size
         if args.total_timesteps < done + batch_size:
@@ -98,17 +102,13 @@ def make_folder(args: Any) -> Path:
         # time. A clock that was set back would hide the new updates.
         for number, file in enumerate(sorted(args.resume.glob("events.out.tfevents.*"))):
             file.rename(args.resume / f"events.out.tfevents.{number:010d}.resumed")
-        shutil.copy(sys.argv[0], args.resume)  # it may have been edited since
+        with contextlib.suppress(shutil.SameFileError):
+            shutil.copy(sys.argv[0], args.resume)  # it may have been edited since
         return args.resume
-    name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    name = name.replace("/", "-").replace(":", "-")
-    for number in range(1, 1000):
-        folder = Path("runs", name if number == 1 else f"{name}_{number}")
-        try:
-            folder.mkdir(parents=True)  # two runs that start together get two folders
-            break
-        except FileExistsError:
-            continue
+    # two runs that start together, also in containers, get two folders
+    name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{token_hex(2)}"
+    folder = Path("runs", name.replace("/", "-").replace(":", "-"))
+    folder.mkdir(parents=True)
     shutil.copy(sys.argv[0], folder)
     print(f"writing to {folder}", flush=True)
     return folder
@@ -144,9 +144,9 @@ class StopSignal:
 
     def __init__(self) -> None:
         self.received: int | None = None
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)  # Windows has no SIGHUP, and nohup ignores it
-            if number and signal.getsignal(number) != signal.SIG_IGN:
+        hangup = getattr(signal, "SIGHUP", signal.SIGTERM)  # Windows has none
+        for number in (signal.SIGINT, signal.SIGTERM, hangup):
+            if signal.getsignal(number) != signal.SIG_IGN:  # as nohup wants it
                 signal.signal(number, self.receive)
 
     def receive(self, number: int, frame: FrameType | None) -> None:
@@ -167,18 +167,15 @@ def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> N
     wrong = [name for name, value in stats.items() if value != value or abs(value) == float("inf")]
     wrong += [name for name, weights in agent.named_parameters() if not weights.isfinite().all()]
     if wrong:
-        raise SystemExit(
-            f"update {iteration}: {', '.join(wrong[:3])} not finite. Lower --learning-rate (TRPO: "
-            "--target-kl) or look at the task's rewards."
-        )
+        names = ", ".join(wrong[:3])
+        raise SystemExit(f"update {iteration}: {names} not finite; try a lower --learning-rate")
 
 
 def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
     """The agent in a run's folder or policy.pt, its task, and the name of its script.
 
     The agent is built by the copy of the script beside policy.pt, which is code that runs, or by
-    the script of that name in this repository. The task has `env_id`, and of a crane `revision` and
-    `options`.
+    the script of that name in this repository.
     """
     path = path / "policy.pt" if path.is_dir() else path
     saved = load(path)

@@ -1,15 +1,13 @@
 """The cranes as a vectorized environment of Stable-Baselines3 (SB3), for its algorithms.
 
-    from crane_utils import trials
-    from crane_utils.sb3 import CraneVecEnv
-    from stable_baselines3 import SAC
-    from stable_baselines3.common.vec_env import VecMonitor
+from crane_utils import trials
+from crane_utils.sb3 import CraneVecEnv
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import VecMonitor
 
-    model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
-    model.learn(100_000)
-    print(trials.evaluate(model, "ForestryCrane-v0", trials=100))
-
-SB3 would simulate one crane at a time. This is faster: all cranes are simulated together.
+model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
+model.learn(100_000)
+print(trials.evaluate(model, "ForestryCrane-v0", trials=100))
 """
 
 from collections.abc import Sequence
@@ -19,7 +17,7 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from crane_utils import trials
+import crane_env  # noqa: F401  registers the tasks
 
 
 class CraneVecEnv(VecEnv):
@@ -30,8 +28,6 @@ class CraneVecEnv(VecEnv):
     """
 
     def __init__(self, num_envs: int, env_id: str = "ForestryCrane-v0", **options: Any):
-        if not trials.crane_class(env_id):
-            raise ValueError(f"{env_id} is not the crane; SB3's make_vec_env takes other tasks")
         self.envs = envs = gymnasium.make_vec(env_id, num_envs, **options).unwrapped
         super().__init__(num_envs, envs.single_observation_space, envs.single_action_space)
 

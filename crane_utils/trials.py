@@ -5,6 +5,7 @@ success as the task says.
 """
 
 import importlib
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import fields
@@ -27,14 +28,16 @@ REPORT_SEED = 60_000  # of the trials behind every reported score
 
 
 def crane_class(env_id: str) -> type[CraneVectorEnv] | None:
-    """The task's subclass of `CraneVectorEnv`, None if it is another task.
-
-    ModuleNotFoundError if there is no such module, gymnasium.error.Error if there is no such task.
-    """
+    """The task's subclass of `CraneVectorEnv`, None if it is another task."""
     module, _, name = env_id.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    creator = gymnasium.spec(name).vector_entry_point
+    try:
+        if module:
+            importlib.import_module(module)
+        creator = gymnasium.spec(name).vector_entry_point
+    except (ModuleNotFoundError, gymnasium.error.Error) as error:
+        if getattr(error, "name", module) != module:  # the user's module lacks another one
+            raise
+        raise SystemExit(f"--env-id {env_id}: {error}") from None
     creator = load_env_creator(creator) if isinstance(creator, str) else creator
     is_crane = isinstance(creator, type) and issubclass(creator, CraneVectorEnv)
     return creator if is_crane else None
@@ -77,21 +80,32 @@ def make_envs(
 
 
 class CheckFinite(gymnasium.vector.VectorWrapper):
-    """FloatingPointError names an observation or a reward of the task that is not finite."""
+    """SystemExit names an observation or a reward of the task that is not finite."""
+
+    def check(self, name: str, values: Array) -> None:
+        for env, *_ in np.argwhere(~np.isfinite(values)):
+            raise SystemExit(f"the {name} of environment {env} is not finite: {values[env]}")
+
+    def reset(self, **kwargs: Any) -> tuple:
+        obs, info = super().reset(**kwargs)
+        self.check("observation", obs)
+        return obs, info
 
     def step(self, actions: Array) -> tuple:
         obs, reward, *rest, info = super().step(actions)
-        ends = [end for end in info.get("final_obs", []) if end is not None]
-        for name, values in (("observation", obs), ("reward", reward), ("last observation", ends)):
-            if len(wrong := np.argwhere(~np.isfinite(values))):
-                env, *index = wrong[0].tolist()
-                value = np.asarray(values)[tuple(wrong[0])]
-                raise FloatingPointError(f"{name} {index or ''} of environment {env} is {value}")
+        self.check("observation", obs)
+        self.check("reward", reward)
+        ends = info.get("final_obs", obs)
+        ends = [row if end is None else end for row, end in zip(obs, ends)]
+        self.check("last observation", np.stack(ends))
         return obs, reward, *rest, info
 
 
 def rollout_report(envs: gymnasium.vector.VectorEnv, infos: list[dict]) -> dict[str, float]:
-    """What TensorBoard shows of a rollout of `make_envs`, from the `info` of each of its steps."""
+    """What TensorBoard shows of a rollout of `make_envs`, from the `info` of each of its steps.
+
+    The success rate is of each crane's last ten episodes, all else of the rollout.
+    """
     report, crane = {}, envs.unwrapped
     ends = [(info, i) for info in infos if "episode" in info for i in info["_episode"].nonzero()[0]]
     if ends:
@@ -135,23 +149,26 @@ def run_trials(
     """
     obs, _ = envs.reset(seed=seeds)
     results, state, ended = {}, None, np.zeros(envs.num_envs, bool)
-    for _ in range(MAX_STEPS):
+    for step in range(MAX_STEPS):
         actions, state = policy.predict(obs, state, deterministic=deterministic)
-        obs, _, terminated, truncated, info = envs.step(actions)
-        first = (terminated | truncated) & ~ended  # later ends belong to other episodes
+        obs, reward, terminated, truncated, info = envs.step(actions)
         values = {} if metrics is None else metrics.after_step(info)
+        first = (terminated | truncated) & ~ended  # later ends belong to other episodes
+        if step == MAX_STEPS - 1:
+            print(f"{(~ended).sum()} episodes have no end in {MAX_STEPS:,} steps", file=sys.stderr)
+            first = ~ended
         if first.any():
             numbers = {k: v for k, v in info.items() if isinstance(v, Array) and v.ndim == 1}
             values |= {k: v for k, v in numbers.items() if k[0] != "_" and v.dtype != object}
-            values["episodic_return"] = info["episode"]["r"]
+            done = terminated | truncated
+            finished = info["episode"]["r"] if done.any() else 0.0
+            values["episodic_return"] = np.where(done, finished, envs.episode_returns)
             for name, value in values.items():
                 results[name] = np.where(first, value, results.get(name, value))
         ended |= first
         if ended.all():
-            return results
-    print(f"{(~ended).sum()} of {len(ended)} episodes did not end within {MAX_STEPS:,} steps")
-    so_far = np.where(ended, results.get("episodic_return", 0.0), envs.episode_returns)
-    return results | {"episodic_return": so_far}
+            break
+    return results
 
 
 def evaluate(
@@ -160,8 +177,7 @@ def evaluate(
 ) -> dict[str, float]:  # fmt: skip
     """Mean return and success rates in trials per diameter (other tasks: trials in all).
 
-    Cranes are judged on the full task: without curriculum, and without repeated starts. Rates are
-    shares in [0, 1].
+    Cranes are evaluated on the full task, without curriculum. Rates are shares in [0, 1].
     """
     if not crane_class(env_id):
         results = run_trials(policy, make_envs(env_id, trials), seed)
