@@ -427,8 +427,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         state, time = self.state(), self.steps * self.dt
 
         # observe
-        obs = self.bounded_observation(state)
-        obs[diverged] = 0.0
+        obs = self.bounded_observation(state, diverged)
 
         # measure
         info = self.measure(state) | {"time": time, "diverged": diverged}
@@ -636,10 +635,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diameter = 2 * self.batch.geom("log").size[:, 0]
         return CraneState(q, dq, *poses, touch > 0, diameter, carried)
 
-    def bounded_observation(self, state: CraneState) -> Array:
-        """`observe` as float32 (N, n) within the space."""
+    def bounded_observation(self, state: CraneState, diverged: Array | bool = False) -> Array:
+        """`observe` as float32 (N, n) within the space, from 0 where a crane diverged."""
         space = self.single_observation_space
-        return np.clip(self.observe(state), space.low, space.high).astype(np.float32, order="C")
+        obs = np.where(np.reshape(diverged, (-1, 1)), 0.0, self.observe(state))
+        return np.clip(obs, space.low, space.high).astype(np.float32, order="C")
 
     def observation_limits(self) -> Array:
         """Lowest and highest value of each number of `observe`, (2, n)."""

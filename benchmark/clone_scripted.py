@@ -20,17 +20,17 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-import numpy as np
-import torch
-import tyro
-from torch import Tensor, nn
-from tqdm import trange
-
 import crane_options
 import crane_runs
 import crane_trials
-import mppo_beta_crane as mppo
+import numpy as np
+import torch
+import tyro
 from crane_options import Factor, Size, Times
+from torch import Tensor, nn
+from tqdm import trange
+
+import mppo_beta_crane as mppo
 from scripted_crane import DT, HYDRAULIC, IDEAL, ScriptedCrane
 
 MARGIN = 0.005  # off 0 and 1, where the script often is: the likelihood is infinite there

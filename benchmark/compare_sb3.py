@@ -29,15 +29,14 @@ from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-import gymnasium
-import numpy as np
-import torch
-import tyro
-
 import crane_options
 import crane_policies
 import crane_runs
 import crane_trials
+import gymnasium
+import numpy as np
+import torch
+import tyro
 from crane_options import Seed
 
 ROOT = Path(__file__).parent.parent

@@ -25,9 +25,10 @@ from plot_curves import PAPER, Run, read, recorded
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from crane_trials import REPORT_SEED
+
 import crane_env
 import eval_crane
-from crane_trials import REPORT_SEED
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent

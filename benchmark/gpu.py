@@ -16,13 +16,12 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_runs
 import gymnasium
 import torch
 import tyro
 from scaling import STEPS, times, write
 from tqdm import tqdm
-
-import crane_runs
 
 HERE = Path(__file__).parent
 SCRIPT = HERE.parent / "mppo_beta_crane.py"

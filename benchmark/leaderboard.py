@@ -23,13 +23,13 @@ from typing import Annotated, Literal
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_trials
 import tyro
+from crane_options import Seed
 from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_env
-import crane_trials
-from crane_options import Seed
 
 HERE = Path(__file__).parent
 BOARD = HERE / "leaderboard.csv"

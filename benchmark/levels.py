@@ -24,24 +24,24 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import matplotlib
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-import numpy as np
-import torch
-import tyro
-from leaderboard import LEVELS
-from mujoco import MjModel
-from tqdm import tqdm
-from tyro.conf import Positional
-
 import crane_options
 import crane_policies
 import crane_runs
 import crane_trials
 import crane_view
-import eval_crane
 import machine
-from crane_env import CraneVectorEnv
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+import tyro
 from crane_options import Range, Seed
+from leaderboard import LEVELS
+from mujoco import MjModel
+from tqdm import tqdm
+from tyro.conf import Positional
+
+import eval_crane
+from crane_env import CraneVectorEnv
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane
 
 HERE = Path(__file__).parent

@@ -15,20 +15,20 @@ from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_policies
+import crane_runs
+import crane_trials
+import crane_view
 import numpy as np
 import torch
 import tyro
+from crane_trials import REPORT_SEED, monte_carlo_trials
 from numpy import ndarray as Array
 from PIL import Image
 from tqdm import tqdm
 from tyro.conf import Positional
 
-import crane_policies
-import crane_runs
-import crane_trials
-import crane_view
 import eval_crane
-from crane_trials import REPORT_SEED, monte_carlo_trials
 
 FIGURES = Path(__file__).parent.parent / "assets" / "figures"
 FPS = 10  # a frame each decision

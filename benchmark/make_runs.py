@@ -29,11 +29,10 @@ from typing import Literal
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import tyro
+from crane_trials import REPORT_SEED
 from export_curve import export
 from tqdm import tqdm
 from tyro.conf import Positional
-
-from crane_trials import REPORT_SEED
 
 HERE = Path(__file__).parent
 WRITING = threading.Lock()  # of evaluations.csv

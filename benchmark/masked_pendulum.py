@@ -21,15 +21,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_options
+import crane_runs
 import gymnasium
 import numpy as np
 import tyro
+from crane_options import Count, Seed
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.wrappers import TransformObservation
-
-import crane_options
-import crane_runs
-from crane_options import Count, Seed
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "masked_pendulum.csv"

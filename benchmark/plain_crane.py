@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-import crane_env
 import crane_options
 import crane_task
 import machine
+
+import crane_env
 
 
 class PlainCrane(gymnasium.Env):

@@ -12,13 +12,12 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import matplotlib
 
 matplotlib.use("Agg")
+import crane_runs
+import machine
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from test_hydraulics import AXES, LABS_FIT, MEASURED, TIMES, response
-
-import crane_runs
-import machine
 
 FIGURE = Path(__file__).parent.parent / "assets" / "figures" / "drives.svg"
 

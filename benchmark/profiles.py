@@ -26,6 +26,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_policies
+import crane_runs
 import mujoco
 import numpy as np
 import tyro
@@ -33,8 +35,6 @@ from plain_crane import PlainCrane
 from torch.profiler import profile
 from tqdm import tqdm
 
-import crane_policies
-import crane_runs
 from crane_env import CraneVectorEnv
 
 ROOT = Path(__file__).parent.parent

@@ -13,10 +13,9 @@ import sb3_contrib
 import stable_baselines3
 import torch
 from plain_crane import PlainCrane
+from sb3_crane import CraneVecEnv
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-
-from sb3_crane import CraneVecEnv
 
 # of both sides
 SEED = 1

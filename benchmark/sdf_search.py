@@ -22,18 +22,18 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-import numpy as np
-import torch
-import tyro
-from tyro.conf import Positional
-
-import crane_env
 import crane_policies
 import crane_runs
 import crane_trials
-import eval_crane
 import machine
+import numpy as np
+import torch
+import tyro
 from crane_task import MAX_MISS, MIN_CLEARANCE
+from tyro.conf import Positional
+
+import crane_env
+import eval_crane
 
 RESULTS = Path(__file__).parent / "sdf_search.csv"
 SETTINGS = [(40, 10), (16, 5), (8, 5), (4, 5)]

@@ -25,6 +25,9 @@ from typing import Any, Literal
 sys.path.insert(0, str(Path(__file__).parent.parent))
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
+import crane_options
+import crane_policies
+import crane_runs
 import numpy as np
 import torch
 import tyro
@@ -33,9 +36,6 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import crane_env
-import crane_options
-import crane_policies
-import crane_runs
 import eval_crane
 from crane_env import CraneVectorEnv
 

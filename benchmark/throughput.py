@@ -43,6 +43,9 @@ from typing import Any, Literal, NamedTuple
 os.environ["OMP_NUM_THREADS"] = "1"  # in all processes; torch is told its own number
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_policies
+import crane_runs
+import crane_task
 import gymnasium
 import mujoco
 import numpy as np
@@ -53,9 +56,6 @@ from plain_crane import PlainCrane, disagreement
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
-import crane_policies
-import crane_runs
-import crane_task
 import eval_crane
 from crane_env import CraneVectorEnv
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane

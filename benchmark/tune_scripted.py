@@ -16,16 +16,16 @@ from typing import Annotated, Literal
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+import crane_options
+import crane_runs
+import crane_trials
 import numpy as np
 import tyro
+from crane_options import Range, Seed
 from leaderboard import LEVELS
 from tqdm import trange
 from tyro.conf import Positional
 
-import crane_options
-import crane_runs
-import crane_trials
-from crane_options import Range, Seed
 from scripted_crane import HYDRAULIC, IDEAL, ScriptedCrane, Settings
 
 FILE = Path(__file__).with_suffix(".csv")

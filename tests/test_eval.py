@@ -1,721 +1,454 @@
-"""The judge: intervals, tables, JSON, files, errors, and that trials are what they claim."""
+"""Trials, the tables of eval_crane.py, and the policies that it takes."""
 
+import contextlib
 import csv
 import json
-import os
-import re
+import shutil
 import subprocess
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
-import gymnasium
-import imageio
 import mujoco
 import numpy as np
 import pytest
 import torch
+import toy_tasks
+from numpy.random import SeedSequence
+from script_runs import ALGORITHMS, ROOT, Recording
 
-import crane_env
-import crane_options
-import crane_policies
-import crane_runs
-import crane_task
-import crane_trials
-import crane_view
 import eval_crane
-import export_onnx
-import machine
-from crane_policies import SHIPPED, FixedPolicy
-from eval_crane import Args, judge
+from crane_utils import export_onnx, film, runs, trials
+from crane_utils.metrics import Metrics
+from eval_crane import SHIPPED, wilson_interval
+from scripted_crane import ScriptedCrane
 
-ROOT = Path(__file__).parent.parent
-CRANE = "ForestryCrane-v0"
-
-
-def run(*arguments, cwd=ROOT):
-    command = [sys.executable, str(ROOT / "eval_crane.py"), *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+QUICK = "toy_tasks:Quick-v0"  # toy_tasks.Quick says how its trials end
+POLICIES = ROOT / "assets" / "policies"
 
 
 @pytest.fixture
-def run_here(monkeypatch, capsys):
-    """run_here(*arguments) gives standard output and standard error of the judge, run here."""
+def judge(monkeypatch, capsys):
+    """judge(*words) runs eval_crane.py here: what it printed (out, err)."""
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["eval_crane.py", *map(str, arguments)])
-        monkeypatch.setattr(sys, "path", sys.path[:])
-        threads = torch.get_num_threads()
-        try:
+    def run(*words):
+        words = [word for part in words for word in str(part).split()]
+        with contextlib.ExitStack() as stack:
+            stack.callback(torch.set_num_threads, torch.get_num_threads())
+            monkeypatch.setattr(sys, "argv", ["eval_crane.py", *words])
+            monkeypatch.setattr(sys, "path", sys.path[:])
             eval_crane.main()
-        finally:
-            torch.set_num_threads(threads)
         return capsys.readouterr()
 
     return run
 
 
-def test_wilson_interval():
-    # by hand: p = 0.96, n = 100, z = 1.959964
-    low, high = eval_crane.wilson_interval(96, 100)
-    assert low == pytest.approx(0.9016, abs=1e-4) and high == pytest.approx(0.9843, abs=1e-4)
-    assert eval_crane.wilson_interval(0, 10) == (0.0, pytest.approx(0.2775, abs=1e-4))
-    assert eval_crane.wilson_interval(10, 10)[1] == pytest.approx(1.0)
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of a short run on quick trials, with an option of its own."""
+    folder = tmp_path_factory.mktemp("trained")
+    line = f"--env-id {QUICK} --num-envs 4 --num-steps 6 --minibatch-size 12 --total-timesteps 24"
+    Recording(folder).run("ppo_crane", line, "--final-trials 1 --hidden-sizes 8 --env.axes world")
+    return next((folder / "runs").iterdir())
 
 
-def test_first_unmet_condition_is_the_failure():
-    end = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, "termination": "time_limit"}
-    end |= {"not_reached": False, "not_lifted": False, "not_held": True, "off_centre": True}
-    care = {name: float(k) for k, name in enumerate(crane_env.CARE)}
-    end |= care
-    kept = {"success": False, "time_to_reach": 2.0, "centre_miss": 0.4, **care}
-    assert eval_crane.trial_record(end) == {**kept, "failure": "not_held"}
-    early = {**end, "termination": "overspeed"}
-    assert eval_crane.trial_record(early) == {**kept, "failure": "overspeed"}
-    good = {**end, "success": True, "not_held": False, "off_centre": False}
-    assert eval_crane.trial_record(good) == {**kept, "success": True, "failure": ""}
+# ---- trials
 
 
-def test_cells():
-    records = [{"diameter": 0.8, "success": True, "failure": "", "gentle": False}]
-    records += [{"diameter": 0.8, "success": True, "failure": "", "gentle": True}] * 2
-    records += [{"diameter": 0.8, "success": False, "failure": "not_held", "gentle": False}]
-    records += [{"diameter": 0.3, "success": False, "failure": "overspeed", "gentle": False}] * 2
-    thin, thick = eval_crane.summarize(records)
-    assert thin["diameter"] == 0.3 and thick["diameter"] == 0.8
-    assert thin["successes"] == 0 and thin["failures"] == {"overspeed": 2}
-    assert thin["gentle_rate"] == 0 and thick["gentle_rate"] == 0.5
-    assert thick["success_rate"] == 0.75 and thick["failures"] == {"not_held": 1}
-    assert thick["trials"] == 4 and thick["interval"] == eval_crane.wilson_interval(3, 4)
-    assert thick["gentle_interval"] == eval_crane.wilson_interval(2, 4)
+class Sway:
+    """Its state counts the steps, which its actions show."""
+
+    def predict(self, obs, state, deterministic=True):
+        steps = 0 if state is None else state
+        return np.full((len(obs), 6), 0.1 * steps * (1 if deterministic else -1)), steps + 1
 
 
-def test_json_and_csv(tmp_path):
-    file = tmp_path / "trials.csv"
-    arguments = ["--policy", "zero", "--trials", "2", "--diameters", "0.4", "0.8", "--seed", "5"]
-    result = run(*arguments, "--json", "--csv", file)
-    assert result.returncode == 0, result.stderr
-    answer = json.loads(result.stdout)  # standard output holds nothing else
-    assert answer["policy"] == "zero" and answer["seed"] == 5 and answer["env_id"] == CRANE
-    assert answer["contact"] == "primitive" and answer["pose_noise"] == "none"
-    assert [cell["diameter"] for cell in answer["cells"]] == [0.4, 0.8]
-    for cell in answer["cells"]:
-        assert cell["trials"] == 2 and cell["successes"] == 0 and cell["success_rate"] == 0
-        assert cell["failures"] == {"not_reached": 2}
-        assert cell["interval"][0] == 0 and 0.6 < cell["interval"][1] < 0.7
-    assert answer["mean_success_rate"] == answer["mean_gentle_rate"] == 0
-    assert answer["mean_success_interval"] == list(eval_crane.wilson_interval(0, 4))
-    assert answer["trials"] == 4 and answer["versions"]["mujoco"] == mujoco.__version__
-    costs = answer["costs"]  # without a success only the force on the ground is known
-    assert costs["peak [kN]"] == 0 and costs["up [s]"] is costs["oil [l]"] is None
-    rows = list(csv.DictReader(file.open()))
-    assert [row["diameter"] for row in rows] == ["0.4", "0.4", "0.8", "0.8"]
-    assert {row["failure"] for row in rows} == {"not_reached"}
-    assert {row["pose_noise"] for row in rows} == {"none"}
-    assert [row["trial"] for row in rows] == ["0", "1", "0", "1"]
-    assert {row["seed"] for row in rows} == {"5"}
+def test_a_trial_is_the_same_beside_any_others(judge, tmp_path, monkeypatch):
+    """Of whatever number, diameters and batch, and another with another seed."""
 
+    def rows(*words):
+        line = f"scripted --env-id {QUICK} --threads 1 --csv {tmp_path}/trials.csv"
+        judge(line, *words)
+        with open(tmp_path / "trials.csv", encoding="utf-8") as file:
+            return {(row["diameter"], row["trial"]): row for row in csv.DictReader(file)}
 
-def test_an_interrupted_judge_keeps_its_trials(run_here, tmp_path, monkeypatch):
-    """Ctrl-C in the second batch of the second table."""
+    many = rows("--trials 3 --diameters 0.4 0.6 0.7")
+    assert len({row["centre_miss"] for row in many.values()}) == len(many) == 9
     monkeypatch.setattr(eval_crane, "CRANES", 2)
-    play, batches = eval_crane.run_trials, []
-
-    def interrupted(*args):
-        batches.append(args)
-        if len(batches) == 4:
-            raise KeyboardInterrupt
-        return play(*args)
-
-    monkeypatch.setattr(eval_crane, "run_trials", interrupted)
-    file = tmp_path / "trials.csv"
-    with pytest.raises(KeyboardInterrupt):
-        line = ("--policy", "zero", "--trials", "2", "--diameters", "0.4", "0.8", "--csv", file)
-        run_here(*line)
-    rows = [(row["pose_noise"], row["diameter"]) for row in csv.DictReader(file.open())]
-    assert rows == [("none", "0.4")] * 2 + [("none", "0.8")] * 2 + [("step", "0.4")] * 2
+    few = rows("--trials 2 --diameters 0.7 0.4")
+    assert [*few] == [("0.7", "0"), ("0.7", "1"), ("0.4", "0"), ("0.4", "1")]
+    assert all(many[trial] == row for trial, row in few.items())
+    other = rows("--trials 1 --diameters 0.4 --seed 3")
+    assert other["0.4", "0"]["centre_miss"] != many["0.4", "0"]["centre_miss"]
 
 
-def test_both_tables_unless_noise_is_given(run_here, tmp_path):
-    file = tmp_path / "trials.csv"
-    both = run_here("--policy", "random", "--trials", "1", "--csv", file).out
-    assert "Table I, clean" in both and "Table II, pose noise" in both
-    assert "| 94 " in both and "| 88 " in both and "96.3" in both
-    rows = list(csv.DictReader(file.open()))
-    assert [row["pose_noise"] for row in rows] == ["none"] * 6 + ["step"] * 6
-    one = run_here("--policy", "random", "--trials", "1", "--pose-noise", "episode").out
-    assert one.count("| mean") == 1 and "Pose noise: random" in one
+def test_seeds_of_trials():
+    """As docs/compare.md defines them: published scores belong to them."""
+    diameters, seeds = trials.monte_carlo_trials(7, 2, [0.3, 0.85])
+    assert diameters.tolist() == [0.3, 0.3, 0.85, 0.85]
+    states = [seed.generate_state(2).tolist() for seed in seeds]
+    keys = [(300, 0), (300, 1), (850, 0), (850, 1)]
+    assert states == [SeedSequence(7, spawn_key=k).generate_state(2).tolist() for k in keys]
+    assert (trials.EVAL_SEED, trials.REPORT_SEED) == (10_000, 60_000)
 
 
-def test_the_papers_figures_stand_beside_the_papers_task_only(run_here, tmp_path):
-    """A policy brings its own options: here the machine's drives under the name of the task."""
-    saved = torch.load(SHIPPED.with_stem("ppo_crane_hydraulic"), weights_only=True)
-    saved["task"]["env_id"] = CRANE
-    torch.save(saved, tmp_path / "policy.pt")
-    short = ["--trials", "1", "--pose-noise", "none", "--diameters", "0.5"]
-    table = run_here(str(tmp_path / "policy.pt"), *short).out
-    assert "Trials: ppo" in table and "Table I" not in table and "| 98 " not in table
-    both = run_here(str(tmp_path / "policy.pt"), str(SHIPPED), *short).out
-    assert "mean of" not in both and f"| {CRANE}, actuators='hydraulic', sensors=True |" in both
-    table = run_here(*short, "--env-id", f"crane_env:{CRANE}").out
-    assert "Table I, clean" in table and "| 98 " in table
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_only_the_first_episode_counts(deterministic):
+    """The thin log's trial ends after 2 steps; its crane begins two more episodes."""
+    diameter = np.array([0.3, 0.7])
+    _, seeds = trials.monte_carlo_trials(1, 1, diameter)
+    envs = trials.make_envs(QUICK, 2, 1, diameter=diameter)
+    metrics = Metrics(envs.unwrapped)
+    results = trials.run_trials(Sway(), envs, seeds, deterministic, metrics)
+    assert results["time"] == pytest.approx([0.2, 0.5])
+    assert results["failure"].tolist() == ["thinnest", ""]
+    assert results["success"].tolist() == results["gentle"].tolist() == [False, True]
+    # each crane alone, in a loop of our own
+    for i in (0, 1):
+        crane = toy_tasks.Quick(1, diameter=diameter[i], env_threads=1, autoreset=False)
+        alone, done, total, steps = Metrics(crane), [False], 0.0, 0
+        crane.reset(seed=[seeds[i]])
+        while not done[0]:
+            actions = np.full((1, 6), 0.1 * steps * (1 if deterministic else -1))
+            _, reward, terminated, truncated, info = crane.step(actions)
+            done, total, steps = terminated | truncated, total + reward[0], steps + 1
+        assert results["episodic_return"][i] == pytest.approx(total)
+        assert results["d_combine"][i] == pytest.approx(info["d_combine"][0])
+        for name, value in alone.values.items():
+            if name != "time_up":
+                assert results[name][i] == pytest.approx(value[0]), name
+    assert results["litres"].min() > 0 and results["time_up"].tolist() == [np.inf, 0.2]
 
 
-def test_several_policies_are_compared(run_here):
-    paths = [str(SHIPPED.with_name(f"{name}.pt")) for name in ("mppo_beta_crane", "ppo_crane")]
-    words = [*paths, "--trials", "4", "--diameters", "0.3", "--seed", "60000"]
-    output = run_here(*words).out
-    assert output.count("Table I, clean") == output.count("Table II, pose noise") == 2
-    table = output[output.index("| task |") :]
-    for noise in ("none", "step"):
-        scores = [
-            json.loads(line)
-            for line in run_here(*words, "--json", "--pose-noise", noise).out.splitlines()
-        ]
-        assert [score["policy"] for score in scores] == paths
-        rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
-        rows = [row[2:] for row in rows if row[:2] == [CRANE, noise]]
-        success, gentle = (
-            [100 * s[f"mean_{which}_rate"] for s in scores] for which in ("success", "gentle")
-        )
-        for row, path, *of in zip(rows, paths, success, gentle):
-            assert row == [*(f"{rate:.1f}" for rate in of), path]
-        assert rows[2] == [f"{np.mean(success):.1f}", f"{np.mean(gentle):.1f}", "mean of 2"]
-
-
-def test_means_over_policies(capsys):
-    """Only policies on one task have a mean."""
-    good, bad = {"success": True, "gentle": True}, {"success": False, "gentle": False}
-    rough = {"success": True, "gentle": False}
-    tables = {("a", "ideal", "none"): [good, good], ("a", "ideal", "step"): [bad, bad]}
-    tables |= {("b", "ideal", "none"): [rough, bad], ("b", "ideal", "step"): [rough, rough]}
-    tables |= {("c", "hydraulic", "none"): [good, rough]}
-    eval_crane.print_comparison(tables)
-    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines()[3:]]
-    assert [" ".join(cell.strip() for cell in row) for row in rows] == [
-        "ideal none 100.0 100.0 a",
-        "ideal none 50.0 0.0 b",
-        "ideal none 75.0 50.0 mean of 2",
-        "ideal step 0.0 0.0 a",
-        "ideal step 100.0 0.0 b",
-        "ideal step 50.0 0.0 mean of 2",
-        "hydraulic none 100.0 50.0 c",
-    ]
-
-
-def test_table_of_costs(capsys):
-    """Medians and the mean time above 20 kN; of the successes, but for the force on the ground."""
-    trial = {name: 0.0 for name in crane_env.CARE} | {"diameter": 0.5, "failure": ""}
-    good = trial | {"success": True, "gentle": True, "time_up": 4.0, "ground_peak": 1e3}
-    rough = trial | {"success": True, "gentle": False, "time_up": 5.0, "ground_peak": 30e3}
-    rough["ground_time"] = 0.3
-    bad = trial | {"success": False, "gentle": False, "time_up": np.inf, "ground_peak": 2e3}
-    records = [good | {"litres": 3.0}, rough | {"litres": 5.0}, bad | {"litres": 1.0}]
-    eval_crane.print_care(records, eval_crane.summarize(records))
-    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if "|" in line]
-    interval = "{:5.1f} - {:5.1f}".format(*(100 * x for x in eval_crane.wilson_interval(1, 3)))
-    expected = ["33.3", interval.strip(), *"2 0 0.1 4 0 0 4.5 0 0".split()]
-    assert [cell.strip() for cell in rows[2]] == ["0.5", *expected]
-    assert [cell.strip() for cell in rows[3]] == ["all", *expected]
-
-
-@pytest.mark.parametrize("algorithm", crane_policies.ALGORITHMS)
-def test_shipped_policies_are_of_this_revision(algorithm, capsys):
-    path = SHIPPED.with_name(f"{algorithm}_crane.pt")
-    _, task, name = crane_policies.load_policy(path)
-    assert name == algorithm and task["env_id"] == CRANE
-    assert task["revision"] == crane_env.REVISION and capsys.readouterr().err == ""
-    # what a policy is trained on is what is registered, but for its training's own options
-    own = {"difficulty", "retry"}
-    trained = {name: task[name] for name in crane_options.DEFAULTS.keys() - own}
-    assert trained.items() <= crane_options.DEFAULTS.items()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", sorted(SHIPPED.parent.iterdir()), ids=lambda p: p.stem)
-def test_shipped_policies_lift_logs(path, run_here):
-    """Four trials of three diameters each, on the level that the policy was made for."""
-    line = ("--json", "--trials", "4", "--diameters", "0.4", "0.5", "0.6", "--seed", "77")
-    answer = json.loads(run_here(path, *line).out)
-    assert answer["mean_success_rate"] >= 0.5 and answer["changed"] == {}
-    level = path.stem.partition("crane")[2].strip("_").title()
-    assert answer["env_id"] == f"ForestryCrane{level}-v0"
-
-
-def test_shipped_policy_in_plain_gymnasium():
-    """gymnasium.make without any option observes what the policy was trained to observe."""
-    policy, _, _ = crane_policies.load_policy(SHIPPED)
-    env, wins = gymnasium.make(CRANE), 0
-    for seed in range(4):
-        obs, _ = env.reset(seed=seed)
-        state, ended = None, False
-        while not ended:
-            actions, state = policy.predict(obs[None], state)
-            obs, _, terminated, truncated, info = env.step(actions[0])
-            ended = terminated or truncated
-        wins += info["success"]
-    assert wins >= 3
-
-
-@pytest.mark.slow
-def test_scripted_crane_is_judged_like_a_policy(run_here):
-    """Environment and script must mean the same angle."""
-    for yaw in ("--signed-yaw", "--no-signed-yaw"):
-        line = ("--policy", "scripted", yaw, "--json", "--trials", "1", "--diameters", "0.5")
-        assert json.loads(run_here(*line).out)["mean_success_rate"] == 1
-
-
-MINE = "crane_env:ForestryCrane-v0"
-
-
-def options_of(*, policy="file", trained_on=None, **args):
-    arguments = Args(policy=policy, **args)
-    return eval_crane.task_of(arguments, trained_on or {"env_id": CRANE})
-
-
-def test_task_to_judge_on(capsys):
-    other = {"offset": "minus", "axes": "world", "signed_yaw": False, "frame_skip": 10}
-    trained_on = {"env_id": MINE, "revision": 6, **crane_options.complete(other)}
-    trained_on |= {"difficulty": 0.0, "retry": 0.25}
-    own = ("difficulty", "retry")  # of the training alone
-    options = {name: trained_on[name] for name in crane_options.DEFAULTS if name not in own}
-    assert options_of(trained_on=trained_on) == (MINE, options)
-    changed = (MINE, options | {"contact": "sdf"})
-    assert options_of(trained_on=trained_on, contact="sdf") == changed
-    assert capsys.readouterr().err == ""
-    # another task is taken as it is registered, and what the policy does not know is said
-    assert options_of(trained_on=trained_on, env_id=CRANE) == (CRANE, {"sensors": False})
-    said = capsys.readouterr().err.splitlines()
-    assert sorted(line.split("=")[0] for line in said) == [
-        f"the policy knows {name}" for name in ("axes", "frame_skip", "offset", "signed_yaw")
-    ]
-    assert "the policy knows axes='world'; ForestryCrane-v0 has 'crane'" in said
-    hydraulic = "ForestryCraneHydraulic-v0"
-    seeing = {"env_id": hydraulic, **crane_options.complete({"sensors": True})}
-    assert options_of(trained_on=seeing, env_id=CRANE) == (CRANE, {"sensors": True})
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == f"the policy was trained on {hydraulic}"
-    assert said[1] == "the policy knows sensors=True; ForestryCrane-v0 has False"
-    scripted = {"axes": "crane", "offset": "plus", "signed_yaw": False}
-    paper = "ForestryCranePaper-v0"
-    assert options_of(policy="scripted", env_id=paper, signed_yaw=False) == (paper, scripted)
-    assert options_of(policy="zero", env_id=paper, contact="sdf") == (paper, {"contact": "sdf"})
-
-
-def test_trials_are_of_the_full_task(tmp_path, run_here):
-    """A task that starts easy is judged as its training judges it."""
-    gymnasium.register(
-        "EasyCrane-v0", vector_entry_point=crane_env.CraneVectorEnv, kwargs={"difficulty": 0.0}
+def test_evaluate_judges_the_full_task():
+    scores = trials.evaluate(Sway(), QUICK, 2, threads=1, options={"reward": "paper"})
+    envs = trials.make_envs(
+        QUICK, 12, 1, {"reward": "paper"}, diameter=np.repeat(trials.DIAMETERS, 2)
     )
-    rows = []
-    for env_id in ("EasyCrane-v0", CRANE):
-        words = f"--policy scripted --env-id {env_id} --trials 2 --diameters 0.5 --pose-noise none"
-        run_here(*words.split(), "--csv", str(tmp_path / "trials.csv"))
-        rows.append((tmp_path / "trials.csv").read_text())
-    assert rows[0] == rows[1]
-    del gymnasium.registry["EasyCrane-v0"]
-
-
-def test_options_of_the_training_are_said(run_here, monkeypatch):
-    """A score under other options than the task's own does not stand beside the paper's."""
-    policy, task, name = crane_policies.load_policy(SHIPPED)
-    words = "--trials 1 --diameters 0.5 --pose-noise none".split()
-    assert "Table I, clean" in run_here(*words).out
-    assert json.loads(run_here(*words, "--json").out)["changed"] == {}
-    task |= {"speed": "mjcf", "retry": 0.5}
-    monkeypatch.setattr(eval_crane, "load_policy", lambda path: (policy, task, name))
-    told = run_here(*words).out
-    assert "speed='mjcf', seed" in told and "Table I" not in told
-    assert json.loads(run_here(*words, "--json").out)["changed"] == {"speed": "mjcf"}
-
-
-def test_the_shipped_policy_knows_the_registered_task(capsys):
-    _, task, _ = crane_policies.load_policy(SHIPPED)
-    eval_crane.task_of(Args(env_id=CRANE), task)
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.slow
-def test_the_papers_task_is_another_than_the_shipped_policys():
-    line = "--env-id ForestryCranePaper-v0 --contact primitive --trials 1 --diameters 0.5 --json"
-    result = run(*line.split())
-    assert result.returncode == 0, result.stderr
-    for known in ("signed_yaw=True", "axes='crane'", "offset='plus'", "frame_skip=20"):
-        assert f"the policy knows {known}; ForestryCranePaper-v0 has " in result.stderr
-    answer = json.loads(result.stdout)
-    assert answer["env_id"] == "ForestryCranePaper-v0" and answer["contact"] == "primitive"
-    assert answer["mean_success_rate"] < 1  # it cannot know where the log is
-
-
-@pytest.mark.slow
-def test_the_contact_model_reported_is_the_one_judged(run_here, monkeypatch):
-    judged = []
-
-    def one_failure(policy, env_id, options, args):
-        envs = crane_trials.make_envs(env_id, 1, **options)
-        judged.append(envs.unwrapped.options["contact"])
-        record = {name: 0.0 for name in crane_env.CARE} | {"success": False}
-        record |= {"time_to_reach": 1.0, "centre_miss": 0.0}
-        return [{"diameter": 0.5, "failure": "overspeed", **record}]
-
-    monkeypatch.setattr(eval_crane, "judge", one_failure)
-    for contact in ([], ["--contact", "primitive"], ["--contact", "sdf"]):
-        for env_id in (CRANE, "ForestryCranePaper-v0"):
-            line = ("--policy", "zero", "--json", "--env-id", env_id, *contact)
-            assert json.loads(run_here(*line).out)["contact"] == judged[-1]
-    assert judged == ["primitive", "sdf"] + ["primitive"] * 2 + ["sdf"] * 2
-
-
-def test_viewer_needs_a_display(run_here, monkeypatch):
-    monkeypatch.setattr(crane_env, "HEADLESS", True)
-    with pytest.raises(SystemExit, match="needs a display"):
-        run_here("--viewer")
-
-
-def test_stochastic_trials_from_the_command_line(run_here, tmp_path):
-    """They differ from the mean action's. --seed repeats them, whatever torch drew before."""
-
-    def misses(*arguments):
-        torch.rand(len(arguments))
-        line = ("--trials", "2", "--diameters", "0.5", "--pose-noise", "none", "--env-threads", "1")
-        run_here(*line, "--csv", tmp_path / "trials.csv", *arguments)
-        with open(tmp_path / "trials.csv") as file:
-            return [row["centre_miss"] for row in csv.DictReader(file)]
-
-    drawn = misses("--stochastic", "--seed", "3")
-    assert drawn == misses("--stochastic", "--seed", "3")
-    assert set(drawn) & set(misses("--seed", "3")) == set()
-
-
-@pytest.mark.slow
-def test_sdf_trials():
-    policy, _, _ = crane_policies.load_policy(SHIPPED)
-    args = Args(trials=2, diameters=(0.5,), seed=3, env_threads=1)
-    records = list(judge(policy, CRANE, {"contact": "sdf"}, args))
-    assert len(records) == 2 and any(record["success"] for record in records)
-
-
-@pytest.mark.parametrize("named", [True, False])  # older files do not name their script
-@pytest.mark.parametrize("script", crane_policies.SCRIPTS)
-def test_acts_as_the_agent_of_any_algorithm(tmp_path, script, named):
-    torch.manual_seed(0)
-    args = script.Args(hidden_sizes=(16,))
-    agent = script.Agent(18, np.full(6, -1.0), np.full(6, 1.0), args)
-    agent.update_normalizer(3 * torch.randn(40, 18) + 1)
-    with torch.no_grad():
-        agent.actor[-1].weight.mul_(100)
-    weights = {k: v for k, v in agent.state_dict().items() if not k.startswith("critic.")}
-    task = {"env_id": CRANE, "revision": crane_env.REVISION, **crane_options.DEFAULTS}
-    low, high = agent.action_low, agent.action_high
-    policy = {
-        "algorithm": script.ALGORITHM,
-        "args": asdict(args),
-        "weights": weights,
-        "task": task,
-        "spaces": {"obs_dim": 18, "low": low, "high": high},
-        "fingerprint": crane_runs.fingerprint(agent, 18),
+    _, seeds = trials.monte_carlo_trials(10_000, 2)
+    results = trials.run_trials(Sway(), envs, seeds)
+    assert scores.pop("episodic_return") == pytest.approx(results["episodic_return"].mean())
+    assert scores == {
+        "success_rate": 0.5,
+        "gentle_rate": pytest.approx(1 / 3),
+        "success_rate_0.3m": 0.0,
+        "success_rate_0.4m": 0.0,
+        "success_rate_0.5m": 0.0,
+        "success_rate_0.6m": 1.0,
+        "success_rate_0.7m": 1.0,
+        "success_rate_0.8m": 1.0,
     }
-    policy |= {"script": Path(script.__file__).name} if named else {}
-    torch.save(policy, tmp_path / "policy.pt")
-    loaded, trained_on, name = crane_policies.load_policy(tmp_path)  # the run's folder or the file
-    assert name == script.ALGORITHM and trained_on == task
-    obs = torch.randn(3, 5, 18)  # three decisions of five cranes
-    with torch.no_grad():
-        seen = agent.normalize(obs)
-        if name == "recurrent_ppo":
-            seen, _ = agent.remember(seen, agent.initial_state(5), torch.zeros(3, 5))
-        expected = agent.to_env(agent.get_distribution(seen).mean)
-    state = None
-    for decision, action in zip(obs, expected):
-        acted, state = loaded.predict(decision.numpy(), state)
-        np.testing.assert_allclose(acted, action, rtol=0, atol=1e-5)
-    assert expected.std() > 0.05
 
 
-def test_fixed_policies():
-    obs = np.zeros((4, 18))
-    actions, _ = FixedPolicy("zero").predict(obs)
-    np.testing.assert_array_equal(actions, np.zeros((4, 6)))
-    torch.manual_seed(1)
-    policy = FixedPolicy("random")
-    actions, later = policy.predict(obs)[0], policy.predict(obs)[0]
-    assert np.abs(actions).max() <= 1 and actions.min() < -0.3 and actions.std() > 0.3
-    assert np.abs(actions - later).max() > 0.1
-    torch.manual_seed(1)  # as each table does
-    np.testing.assert_array_equal(actions, policy.predict(obs)[0])
+def test_evaluate_other_tasks(monkeypatch, capsys):
+    class Zero:
+        def predict(self, obs, state, deterministic):
+            assert obs.shape == (3, 2) and deterministic
+            return np.zeros((3, 1), np.float32), None
+
+    assert trials.evaluate(Zero(), "toy_tasks:Endless-v0", 3) == {"episodic_return": 5.0}
+    monkeypatch.setattr(trials, "MAX_STEPS", 40)
+    assert trials.evaluate(Zero(), "toy_tasks:NoEnd-v0", 3) == {"episodic_return": 40.0}
+    assert capsys.readouterr().err == "3 episodes have no end in 40 steps\n"
 
 
-def test_same_trial_in_any_batch(monkeypatch):
-    """A trial does not depend on which trials are simulated beside it.
-
-    With fixed actions to the bit; a network's rounding may change with the size of its batch.
-    """
-    args = Args(trials=4, diameters=(0.3, 0.7), seed=3, env_threads=1)
-    together = list(judge(FixedPolicy("zero"), CRANE, {}, args))
-    assert [record["diameter"] for record in together] == [0.3] * 4 + [0.7] * 4
-    assert len({record["centre_miss"] for record in together}) == 8
-    monkeypatch.setattr(eval_crane, "CRANES", 3)
-    assert list(judge(FixedPolicy("zero"), CRANE, {}, args)) == together
+# ---- tables
 
 
-@pytest.fixture
-def open_gl():
-    try:
-        mujoco.Renderer(machine.load_model(), 8, 8).close()
-    except Exception as error:
-        pytest.skip(f"no OpenGL here: {error}")
+def test_wilson_interval():
+    """By hand: p = 0.96, n = 100, z = 1.959964."""
+    assert wilson_interval(96, 100) == pytest.approx((0.90163, 0.98434), abs=1e-5)
+    assert wilson_interval(0, 10) == pytest.approx((0.0, 0.27754), abs=1e-5)
+    assert wilson_interval(10, 10) == pytest.approx((0.72247, 1.0), abs=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mp4", "gif"])
-def test_video(tmp_path, run_here, monkeypatch, open_gl, kind):
-    monkeypatch.setattr(crane_task, "REACH_TIME", 0.4)  # an idle crane fails then
-    film, seeds = tmp_path / f"film.{kind}", []
-
-    class Trial(crane_view.Trial):
-        def __init__(self, crane, seed, diameter):
-            seeds.append(seed.spawn_key)
-            super().__init__(crane, seed, diameter)
-
-    monkeypatch.setattr(crane_view, "Trial", Trial)
-    line = ("--policy", "zero", "--diameters", "0.5", "0.7", "--video", film, "--width", "128")
-    assert f"2 trials filmed in {film}, 0 succeeded" in run_here(*line, "--trial", "3").out
-    assert seeds == [(500, 3), (700, 3)]  # as the fourth trials of monte_carlo_trials
-    frames = imageio.mimread(film, memtest=False)
-    assert frames[0].shape[:2] == (72, 128) and np.std(frames[0]) > 10
-    # 20 frames a second and ten of the end; a .gif leaves out frames that are as the one before
-    assert len(frames) == 2 * (8 + 10) if kind == "mp4" else 2 <= len(frames) <= 36
-    assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50  # of another trial
-    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+def cells(printed):
+    """Tables by their titles: lines by their names, cells by their headings."""
+    tables, head = [], None
+    for line in printed.splitlines():
+        if not line.startswith("|"):
+            head = None
+            continue
+        row = [cell.strip() for cell in line.split("|")[1:-1]]
+        if head is None:
+            head = row
+            tables.append({})
+        elif set(row[-1]) != {"-"}:
+            tables[-1][row[0]] = dict(zip(head[1:], row[1:]))
+    return tables
 
 
-def test_a_film_counts_its_successes(tmp_path, run_here, monkeypatch, open_gl):
-    """The scripted crane lifts one log and is too late for another."""
-    monkeypatch.setattr(crane_view, "FPS", 1)
-    film, late = tmp_path / "film.mp4", crane_task.REACH_TIME
+def test_table_csv_and_json(judge, tmp_path):
+    line = f"scripted --env-id {QUICK} --trials 4 --diameters 0.3 0.5 0.7 0.8 --threads 1"
+    printed = judge(line, f"--csv {tmp_path}/trials.csv").out
+    with open(tmp_path / "trials.csv", encoding="utf-8") as file:
+        rows = [*csv.DictReader(file)]
+    assert [row["trial"] for row in rows] == ["0", "1", "2", "3"] * 4
+    assert {row["policy"] for row in rows} == {"scripted"}
+    assert [row["failure"] for row in rows] == ["thinnest"] * 4 + ["thin"] * 4 + [""] * 8
+    assert [row["gentle"] for row in rows] == ["False"] * 8 + ["True"] * 4 + ["False"] * 4
+    wins = [row for row in rows if row["success"] == "True"]
+    assert [row["diameter"] for row in wins] == ["0.7"] * 4 + ["0.8"] * 4
+    (table,) = cells(printed)
+    assert f"on {QUICK}, seed 10000" in printed
+    assert [*table] == ["0.3 m", "0.5 m", "0.7 m", "0.8 m", "all"]
+    assert table["0.3 m"]["failures"] == "thinnest 4" and table["0.3 m"]["success %"] == "0"
+    assert table["0.8 m"]["failures"] == "" and table["0.8 m"]["trials"] == "4"
+    low, high = wilson_interval(8, 16)
+    total = table["all"]
+    assert total["95 % interval"] == f"{100 * low:.1f}-{100 * high:.1f}"
+    assert (total["success %"], total["gentle %"], total["paper %"]) == ("50", "25", "")
+    assert total["failures"] in ("thinnest 4, thin 4", "thin 4, thinnest 4")
+    for head, average, key, factor in [
+        ("miss [m]", np.mean, "centre_miss", 1),
+        ("oil [l]", np.median, "litres", 1),
+        ("energy [kJ]", np.median, "energy", 1e-3),
+        ("swing [rad]", np.median, "swing_peak", 1),
+        ("up [s]", np.median, "time_up", 1),
+    ]:
+        expected = average([factor * float(row[key]) for row in wins])
+        assert float(total[head]) == pytest.approx(expected, rel=1e-3), head
+    peaks = [float(row["ground_peak"]) / 1000 for row in rows]
+    assert float(total["peak [kN]"]) == pytest.approx(np.median(peaks), rel=1e-3)
 
-    class Trial(crane_view.Trial):
-        def __init__(self, crane, seed, diameter):
-            monkeypatch.setattr(crane_task, "REACH_TIME", 0.4 if diameter == 0.5 else late)
-            super().__init__(crane, seed, diameter)
+    answer = json.loads(judge(line, "--json").out)
+    assert answer["policy"] == "scripted" and answer["env_id"] == QUICK and answer["seed"] == 10_000
+    assert answer["revision"] == 3 and answer["options"] == asdict(toy_tasks.Quick.Options())
+    assert answer["versions"]["mujoco"] == mujoco.__version__
+    for name, named in answer["table"].items():
+        for head, value in named.items():
+            cell = f"{value:.4g}" if isinstance(value, float) else str(value)
+            assert table[name][head] == cell
 
-    monkeypatch.setattr(crane_view, "Trial", Trial)
-    line = ("--policy", "scripted", "--diameters", "0.4", "0.5", "--width", "128")
-    assert f"2 trials filmed in {film}, 1 succeeded" in run_here(*line, "--video", film).out
 
-
-def test_clear_errors(tmp_path, run_here, capsys):
-    def error_of(*arguments):
-        """One line, or the words in the box that shows a wrong argument."""
-        with pytest.raises(SystemExit) as error:
-            run_here(*arguments)
-        box = re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err)
-        return " ".join(box.split()) if error.value.code == 2 else str(error.value)
-
-    assert "no file nowhere.pt; train one first" in error_of("nowhere.pt")
-    assert "no file scripted; --policy scripted" in error_of("scripted")
-    for run in ("old", "new"):
-        (tmp_path / "runs" / run).mkdir(parents=True)
-        (tmp_path / "runs" / run / "policy.pt").touch()
-    os.utime(tmp_path / "runs" / "old" / "policy.pt", (0, 0))
-    assert f"the newest run there is {tmp_path}/runs/new" in error_of(tmp_path / "runs")
-    assert f"the newest run there is {tmp_path}/runs/new" in error_of(tmp_path / "runs" / "typo")
-    assert str(ROOT / "tests" / "policy.pt") in error_of(str(ROOT / "tests"))  # a run's folder
-    assert "at least one number" in error_of("--diameters")
-    assert "names a diameter twice" in error_of("--diameters", "0.5", "0.5")
-    assert "mean action only" in error_of("policy.onnx", "--stochastic")
-    assert "must end in .mp4 or .gif" in error_of("--video", "film.avi")
-    assert "brings its own" in error_of("--no-signed-yaw")
-    assert "--trial and --camera are for --video" in error_of("--trial", "3")
-    assert "--trial and --camera are for --video" in error_of("--camera", "side")
-    assert "--width is for --video" in error_of("--width", "320")
-    assert "drop --trials" in error_of("--video", "lift.mp4", "--trials", "2")
-    wide = error_of("--video", "lift.mp4", "--width", "4000")
-    assert "width must be a whole number in [64, 1,920], got 4000" in wide
-    assert "--width must be even" in error_of("--video", "lift.mp4", "--width", "321")
-    assert "choose --video or --viewer" in error_of("--video", "lift.mp4", "--viewer")
-    assert "no folder nowhere" in error_of("--csv", "nowhere/trials.csv")
-    assert "each of diameters must be a number in [0.3, 0.8]" in error_of("--diameters", "0.2")
-    assert "trials must be a whole number in [1, 10,000], got 0" in error_of("--trials", "0")
-    assert "seed must be a whole number in [0, " in error_of("--seed", "-1")
-    assert "env_threads must be a whole number in [0, 256]" in error_of("--env-threads", "-1")
-    assert "PATH goes with" in error_of(tmp_path / "junk.pt", "--policy", "zero")
-    assert "PATH names a policy twice" in error_of(SHIPPED, SHIPPED)
-    two = [SHIPPED, SHIPPED.with_name("ppo_crane.pt")]
-    assert "take one policy" in error_of(*two, "--csv", "trials.csv")
-    assert "--stochastic goes with" in error_of("--policy", "random", "--stochastic")
-    assert "judge nothing" in error_of("--video", tmp_path / "lift.mp4", "--json")
-    assert "is no file" in error_of("--csv", tmp_path)
-    assert "is no file" in error_of("--csv", "/dev/full")  # renaming would replace it
-    slow = error_of("--policy", "scripted", "--env-id", "ForestryCranePaper-v0")
-    assert slow == "the scripted crane decides every 0.1 s, not every 0.005 s"
-    gymnasium.register(
-        "FastCrane-v0", vector_entry_point=crane_env.CraneVectorEnv, kwargs={"speed": "mjcf"}
+def test_gentle_trials_and_failures_are_counted():
+    row = {"diameter": 0.5, "failure": "", "success": True, "gentle": True, "ground_peak": 1e3}
+    row |= {key: 2.0 for _, key, _, _ in eval_crane.AVERAGES}
+    rough = row | {"gentle": False, "ground_peak": 30e3, "time_to_reach": 3.0}
+    lost = rough | {"success": False, "failure": "not_held", "time_to_reach": 99.0}
+    line = eval_crane.summarize(
+        [row, rough, rough, lost, lost | {"failure": "thin"}, lost], {0.5: 98}
     )
-    fast = error_of("--policy", "scripted", "--env-id", "FastCrane-v0")
-    assert fast == "the scripted crane knows the speed limits of the real machine only"
+    assert (line["trials"], line["success %"], line["paper %"]) == (6, 50, 98)
+    assert line["gentle %"] == pytest.approx(100 / 6) and line["peak [kN]"] == 30
+    assert line["reach [s]"] == pytest.approx(8 / 3)  # of successes alone
+    assert line["failures"] == "not_held 2, thin 1"
+    assert eval_crane.summarize([lost], {})["reach [s]"] == ""
 
 
-def test_clear_errors_of_damaged_policies(tmp_path, capsys):
+def test_the_papers_figures_stand_beside_its_task(judge):
+    line = "zero --trials 1 --diameters 0.3 0.4"
+    (table,) = cells(judge(line).out)
+    assert [row["paper %"] for row in table.values()] == ["94", "96", "95"]
+    (table,) = cells(judge(line, "--env.pose-noise step").out)
+    assert table["all"]["paper %"] == "91"
+    (table,) = cells(judge(line, "--env-id ForestryCraneHydraulic-v0").out)
+    assert table["all"]["paper %"] == ""
+
+
+def test_several_policies_are_compared(judge, trained):
+    printed = judge(f"zero {trained} --env-id {QUICK} --trials 1 --diameters 0.4 0.8").out
+    zero, ours, both = cells(printed)
+    assert [*both] == ["zero (zero)", f"ppo_crane.py ({trained})"]
+    assert both["zero (zero)"] == zero["all"] and both[f"ppo_crane.py ({trained})"] == ours["all"]
+
+
+def test_sampled_actions_follow_the_seed(judge, trained):
+    line = f"{trained} --trials 2 --diameters 0.6 --threads 1 --json"
+    mean, drawn, again, other = (
+        json.loads(judge(line, words).out)["table"]["all"]["swing [rad]"]
+        for words in ("--seed 3", *["--seed 3 --stochastic"] * 2, "--seed 4 --stochastic")
+    )
+    assert drawn == again and len({mean, drawn, other}) == 3
+
+
+def test_a_film_is_of_the_trial_that_was_asked_for(judge, monkeypatch, trained):
+    films = []
+    monkeypatch.setattr(film, "film", lambda *args, **kwargs: films.append((args, kwargs)))
+    line = f"{trained} --video a.mp4 --seed 60000 --trial 17 --diameters 0.3 --camera side"
+    judge(line, "--stochastic --env.offset minus")
+    ((_, name, env_id, options, path, diameters), how) = films[0]
+    assert (name, env_id, path.name, diameters) == ("ppo_crane.py", QUICK, "a.mp4", (0.3,))
+    assert (options["axes"], options["offset"]) == ("world", "minus")
+    assert how == {
+        "seed": 60000, "trial": 17, "camera": "side", "width": 640, "deterministic": False
+    }  # fmt: skip
+
+
+# ---- policies
+
+
+def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained):
+    line = f"{trained} --trials 1 --diameters 0.5"
+    asked = judge(line)
+    assert f"on {QUICK}, axes=world, seed" in asked.out and not asked.err.count("made for")
+    asked = judge(line, "--env.axes crane --env.frame-skip 10")
+    assert f"on {QUICK}, frame_skip=10, seed" in asked.out
+    assert "the policy was made for axes 'world', not 'crane'" in asked.err
+    assert "the policy was made for frame_skip 20, not 10" in asked.err
+    asked = judge(line, "--env-id ForestryCrane-v0")  # as it is registered
+    assert "on ForestryCrane-v0, seed" in asked.out
+    assert "the policy was made for axes 'world', not 'crane'" in asked.err
+    assert "the policy was made for revision 3, not 7" in asked.err
+
+
+def test_a_run_is_built_by_the_script_that_made_it(trained, tmp_path):
+    """Not by the repository's, and not by that of another run which was loaded before."""
+    other = tmp_path / "run"
+    shutil.copytree(trained, other)
+    text = (other / "ppo_crane.py").read_text(encoding="utf-8")
+    (other / "ppo_crane.py").write_text(text.replace("nn.Tanh()", "nn.ReLU()"), encoding="utf-8")
+    agents = [runs.load_policy(path)[0] for path in (trained, other, trained / "policy.pt")]
+    kinds = [type(agent.actor[1]) for agent in agents]
+    assert kinds == [torch.nn.Tanh, torch.nn.ReLU, torch.nn.Tanh]
+    (other / "ppo_crane.py").unlink()  # then the repository's serves
+    assert type(runs.load_policy(other)[0].actor[1]) is torch.nn.Tanh
+    saved = runs.load(other / "policy.pt")
+    torch.save(saved | {"script": "gone.py"}, other / "policy.pt")
+    with pytest.raises(SystemExit, match="needs gone.py, whose Agent it holds, beside it"):
+        runs.load_policy(other)
+
+
+class Harmful:
+    def __reduce__(self):
+        return print, ("code ran",)
+
+
+def test_a_policy_that_does_not_fit_is_refused_in_a_line(judge, tmp_path, trained, capsys):
     path = tmp_path / "policy.pt"
 
-    def error_of(**change):
-        torch.save(saved | change, path)
-        with pytest.raises(SystemExit) as error:
-            crane_policies.load_policy(path)
-        return str(error.value).removeprefix(str(path))
+    def refused(*words):
+        with pytest.raises(SystemExit) as end:
+            judge(*words, "--trials 1")
+        said = str(end.value)
+        assert "\n" not in said
+        return said
 
-    saved = torch.load(SHIPPED, weights_only=True)
-    known = "mppo_beta, ppo, trpo, recurrent_ppo"
-    gone = f": unknown algorithm 'sac'; known: {known}; its script sac.py is not in this folder"
-    assert error_of(algorithm="sac", script="sac.py") == gone
-    older = {"algorithm": "sac", "script": ""}  # files that do not name their script
-    assert error_of(**older) == f": unknown algorithm 'sac'; known: {known}"
-    for change in [
-        {"args": saved["args"] | {"hidden_sizes": (8, 8)}},
-        {"args": saved["args"] | {"warp": 9}},
-        {"weights": 3},
-    ]:
-        said = error_of(**change)
-        assert said.startswith(" does not fit mppo_beta_crane.py: ")
-        assert said.endswith("; undo the change of mppo_beta_crane.py or train again")
-    assert "acts otherwise" in error_of(fingerprint=saved["fingerprint"][:-1])
-    # the first files had a number as task
-    for change in ({"args": 3}, {"task": 6}, {"script": None}, {"fingerprint": None}):
-        assert error_of(**change) == " is no policy.pt of this repository"
-    pendulum = {"task": {"env_id": "Pendulum-v1"}, "algorithm": "sac", "script": "sac.py"}
-    assert error_of(**pendulum) == " was trained on Pendulum-v1, not on the crane"
-    for name in saved:  # each is needed, but for the name of the script and the decisions so far
-        torch.save({key: value for key, value in saved.items() if key != name}, path)
-        if name not in ("script", "global_step"):
-            with pytest.raises(SystemExit, match="policy.pt "):
-                crane_policies.load_policy(path)
-    path.write_bytes(b"junk")
-    with pytest.raises(SystemExit, match="is no policy.pt of this repository"):
-        crane_policies.load_policy(path)
-    assert capsys.readouterr().err == ""
-    torch.save(saved | {"task": saved["task"] | {"revision": -1}}, path)
-    crane_policies.load_policy(path)
-    assert "was trained on task revision -1" in capsys.readouterr().err
-
-
-def test_an_edited_copy_of_a_script_is_judged_with_its_own_network(tmp_path, monkeypatch, run_here):
-    copy = tmp_path / "my_ppo_crane.py"
-    copy.write_text((ROOT / "ppo_crane.py").read_text().replace("nn.Tanh()", "nn.ReLU()"))
-    line = "--num-envs 2 --num-steps 8 --minibatch-size 8 --total-timesteps 16 --eval-every 0"
-    command = [sys.executable, str(copy), *line.split(), "--final-trials", "0"]
-    paths = {**os.environ, "PYTHONPATH": str(ROOT)}
-    subprocess.run(command, cwd=tmp_path, env=paths, check=True, capture_output=True)
-    (path,) = tmp_path.glob("runs/*/policy.pt")
-    monkeypatch.chdir(tmp_path)
-    agent, _, name = crane_policies.load_policy(path)
-    assert isinstance(agent.actor[1], torch.nn.ReLU) and name == "my_ppo_crane.py"
-    export_onnx.main(path, tmp_path / "policy.onnx")
-    assert crane_policies.load_policy(tmp_path / "policy.onnx")[2] == "my_ppo_crane.py"
-    printed = run_here(path, "--trials", "1", "--pose-noise", "none").out
-    assert "my_ppo_crane.py (" in printed and "| 0.8 " in printed
-    scores = printed[printed.index("| task |") :]
-    assert str(path) in scores and "mean of" not in scores
-    copy.write_text(copy.read_text().replace("nn.ReLU()", "nn.SiLU()"))
-    with pytest.raises(SystemExit, match="undo the change of my_ppo_crane.py or train"):
-        crane_policies.load_policy(path)
-    copy.rename(tmp_path / "gone.py")
-    said = (
-        "/ppo_crane.py acts otherwise than in the training; my_ppo_crane.py wrote it; copy my_ppo"
-    )
-    with pytest.raises(SystemExit, match=said):
-        crane_policies.load_policy(path)
-    saved = torch.load(path, weights_only=True)
-    torch.save({key: value for key, value in saved.items() if key != "script"}, path)
-    with pytest.raises(SystemExit, match="otherwise than in the training; undo the change of ppo_"):
-        crane_policies.load_policy(path)
-    torch.save(saved | {"algorithm": "my_ppo"}, path)
-    with pytest.raises(SystemExit, match="its script my_ppo_crane.py is not in this folder"):
-        crane_policies.load_policy(path)
-
-
-@pytest.mark.parametrize("script", ["mppo_beta_crane.py", "mppo_beta_torchrun.py"])
-def test_our_scripts_are_no_edited_copies(tmp_path, script):
-    torch.save(torch.load(SHIPPED, weights_only=True) | {"script": script}, tmp_path / "policy.pt")
-    assert crane_policies.load_policy(tmp_path)[2] == "mppo_beta"
-
-
-def test_a_missing_policy_is_met_before_the_first_trial(tmp_path, run_here, capsys):
-    with pytest.raises(SystemExit, match="no file"):
-        run_here(SHIPPED, tmp_path / "nowhere.pt", "--trials", "1")
+    ours, theirs = "18 observations and actions", "32 observations and actions"
+    said = refused(f"{trained} --env-id ForestryCraneHydraulic-v0")
+    assert ours in said and theirs in said and "ForestryCraneHydraulic-v0" in said
+    saved = runs.load(trained / "policy.pt")
+    weights = saved["weights"]
+    torch.save(saved | {"weights": weights | {"action_high": weights["action_high"] * 2}}, path)
+    assert "[2.0, 2.0, 2.0, 2.0, 2.0, 2.0]" in refused(path)
+    torch.save(saved | {"weights": weights | {"log_std": weights["log_std"] * np.nan}}, path)
+    assert "log_std not finite" in refused(path)
+    torch.save(saved | {"weights": Harmful()}, path)
+    with pytest.raises(Exception, match="[Ww]eights"):  # pickled code is not run
+        judge(path)
+    assert "code ran" not in capsys.readouterr().out
+    assert "Pendulum-v1 is not the crane" in refused(f"{trained} --env-id Pendulum-v1")
+    assert "no nowhere.pt: give a run's folder" in refused("nowhere.pt")
+    assert "no nowhere" in refused(f"{trained} nowhere")  # before the first trial
     assert capsys.readouterr().out == ""
 
 
-def test_a_policy_of_the_users_own(tmp_path, monkeypatch, run_here):
-    """It is made anew for each batch of trials, and may remember what it saw in that batch."""
-    (tmp_path / "my_module.py").write_text(
-        "import numpy as np, torch\n"
-        "class Counter:\n"
-        "    made = 0\n"
-        "    def __init__(self): self.steps, Counter.made = 0, Counter.made + 1\n"
-        "    def __call__(self, obs):\n"
-        "        self.steps += 1\n"
-        "        assert self.steps <= 90\n"
-        "        return np.zeros((len(obs), 6))\n"
-        "class Model:\n"
-        "    def predict(self, obs, state, deterministic): return torch.zeros(len(obs), 6), 1\n"
-        "def wide(): return lambda obs: np.zeros((len(obs), 7))\n"
-        "def lost(): return lambda obs: np.full((len(obs), 6), np.nan)\n"
-        "def needy(gain): pass\n"
-        "def dumb(): return 5\n"
-        "def empty(): return lambda obs: None\n"
-        "def words(): return lambda obs: [['left'] * 6] * len(obs)\n"
-        "def ragged(): return lambda obs: [[0.0] * 6, [0.0]]\n"
-        "def listed(): return lambda obs: [[0.0] * 6] * len(obs)\n"
-        "def backward(): return lambda obs: obs[:, 5::-1]\n"
-        "class Bare:\n"
-        "    def predict(self, obs, state, deterministic): return np.zeros((len(obs), 6))\n"
-    )
+def test_a_policy_of_the_users_own(judge, tmp_path, monkeypatch):
+    code = "import numpy as np\nclass Slew:\n    task = {'env_id': 'toy_tasks:Quick-v0'}\n"
+    code += "    def predict(self, obs, state, deterministic):\n"
+    code += "        assert obs.shape == (1, 18) and deterministic\n"
+    code += "        return np.full((1, 6), 0.5), state\n"
+    (tmp_path / "my_policy.py").write_text(code)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(eval_crane, "CRANES", 4)
-    out = run_here("--policy", "my_module:Counter", "--trials", "1", "--pose-noise", "none").out
-    assert "mine (my_module:Counter)" in out
-    assert sys.modules["my_module"].Counter.made == 2  # six trials, four at a time
-    for policy in ("Model", "listed", "backward"):
-        line = ("--policy", f"my_module:{policy}", "--trials", "1", "--pose-noise", "none")
-        assert f"mine (my_module:{policy})" in run_here(*line).out
-    for policy, said in [
-        ("my_module:lost", "actions contain NaN or infinity"),
-        ("my_module:needy", "missing a required argument: 'gain'; needy must be a class or"),
-        ("my_module:dumb", "5 is no function"),
-        ("my_module:empty", r"numbers \(4, 6\) for observations \(4, 18\), got object \(\)"),
-        ("my_module:words", "got <U4"),
-        ("my_module:ragged", "actions are no array"),
-        ("my_module:Bare", "predict must return actions and a state"),
-        ("my_module:wide", r"actions must be numbers \(4, 6\) .* got float64 \(4, 7\)"),
-        ("my_module:nothing", "my_module.py has no nothing"),
-        ("no_package.module:Policy", "No module named 'no_package'"),
-        (":Policy", "or my_module:MyPolicy, got ':Policy'"),
-        ("no_module:Policy", "--policy no_module:Policy: No module named 'no_module'"),
-        ("scripetd", "--policy must be file, scripted, zero, random or my_module:MyPolicy"),
-    ]:
-        with pytest.raises(SystemExit, match=said):
-            run_here("--policy", policy, "--trials", "1")
+    printed = judge("my_policy:Slew --trials 1 --diameters 0.8").out
+    assert f"my_policy:Slew (my_policy:Slew) on {QUICK}" in printed
 
 
-def test_errors_of_the_users_code_keep_their_traceback(tmp_path, monkeypatch, run_here):
-    (tmp_path / "broken.py").write_text("import numpy\nnumpy.flot32\n")
-    (tmp_path / "importer.py").write_text("import missing_library\n")
-    monkeypatch.chdir(tmp_path)
-    for words, error in [
-        (("--policy", "broken:Policy"), AttributeError),
-        (("--policy", "importer:Policy"), ModuleNotFoundError),
-        (("--policy", "zero", "--env-id", "broken:Crane-v0"), AttributeError),
-        (("--policy", "zero", "--env-id", "importer:Crane-v0"), ModuleNotFoundError),
-    ]:
-        with pytest.raises(error):
-            run_here(*words, "--trials", "1")
+def test_built_in_policies():
+    obs = np.zeros((40, 18))
+    for name, expected in [("zero", eval_crane.Zero), ("scripted", ScriptedCrane)]:
+        assert type(eval_crane.load_policy(name)[0]).__name__ == expected.__name__
+    assert not eval_crane.Zero().predict(obs, None)[0].any()
+    actions, _ = eval_crane.Random().predict(obs, None)
+    assert actions.shape == (40, 6) and actions.min() < -0.9 and actions.max() > 0.9
 
 
-@pytest.mark.parametrize("policy", ["file", "zero"])
-@pytest.mark.parametrize(
-    "env_id", ["Nowhere-v0", "nowhere:Crane-v0", "nowhere.crane:Crane-v0", "Pendulum-v1"]
-)
-def test_clear_errors_of_tasks(run_here, policy, env_id):
-    with pytest.raises(SystemExit, match=env_id):
-        run_here("--policy", policy, "--env-id", env_id, "--trials", "1")
+@pytest.mark.parametrize("path", sorted(POLICIES.iterdir()), ids=lambda path: path.stem)
+def test_shipped_policies_are_of_the_registered_tasks(path):
+    agent, task, script = runs.load_policy(path)
+    level = path.stem.partition("crane")[2].strip("_").title()
+    assert task["env_id"] == f"ForestryCrane{level}-v0" and path.stem.startswith(script[:-3])
+    assert task["revision"] == trials.crane_class(task["env_id"]).REVISION
+    assert task["options"] == asdict(trials.task_options(task["env_id"]))
+
+
+def test_the_shipped_policy_lifts_logs(judge):
+    line = "--json --trials 3 --diameters 0.4 0.5 0.6 --seed 77"
+    answer = json.loads(judge(line).out)
+    assert answer["policy"] == SHIPPED and answer["table"]["all"]["success %"] > 80
+
+
+def test_acting_loads_neither_tensorboard_nor_distributed():
+    code = f"import sys; from crane_utils import runs; runs.load_policy(runs.Path({SHIPPED!r}))"
+    code += "; print(*sys.modules, sep='\\n')"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert "crane_utils.runs" in ran.stdout, ran.stderr
+    loaded = {name.partition(".")[0] for name in ran.stdout.split()}
+    assert not loaded & {"tensorboard", "matplotlib", "onnx", "stable_baselines3"}
+
+
+# ---- elsewhere
+
+
+@pytest.mark.parametrize("script", ALGORITHMS)
+def test_onnx_acts_as_the_policy(tmp_path, script):
+    """In turn, with its memory, for another number of cranes than at the export."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    path, file = POLICIES / f"{script}.pt", tmp_path / "policy.onnx"
+    export_onnx.main(path, file)
+    (agent, *_), state = runs.load_policy(path), None
+    session = onnxruntime.InferenceSession(file)
+    memory = {i.name: np.zeros((7, i.shape[1]), "f4") for i in session.get_inputs()[1:]}
+    assert len(memory) == (2 if "recurrent" in script else 0)
+    for obs in np.random.default_rng(0).normal(size=(4, 7, 18)).astype("f4"):
+        actions, *after = session.run(None, {"obs": obs, **memory})
+        memory = dict(zip(memory, after))
+        expected, state = agent.predict(obs, state)
+        np.testing.assert_allclose(actions, expected, atol=1e-5)
+    assert np.ptp(expected) > 0.1
+
+
+def test_a_predict_that_a_trace_cannot_repeat_is_not_exported(tmp_path, trained, monkeypatch):
+    pytest.importorskip("onnxruntime")
+    shutil.copytree(trained, tmp_path / "run")
+    script = tmp_path / "run" / "ppo_crane.py"
+    line = "distribution = self.get_distribution(self.normalize(obs))\n"
+    text = script.read_text(encoding="utf-8")
+    assert line in text
+    edited = line + "        obs = distribution.mean if obs.sum() > 0 else -distribution.mean\n"
+    edited += "        return self.to_env(obs), None\n"
+    script.write_text(text.replace(line, edited), encoding="utf-8")
+    with pytest.raises(SystemExit, match="a trace cannot repeat"):
+        export_onnx.main(tmp_path / "run", tmp_path / "policy.onnx")
+    assert not (tmp_path / "policy.onnx").exists()
+
+
+def test_stable_baselines_sees_the_same_cranes(monkeypatch):
+    """Also over the ends of episodes, where it wants the last observation in `infos`."""
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from crane_utils.sb3 import CraneVecEnv
+
+    view, cranes = CraneVecEnv(5, QUICK, env_threads=1), toy_tasks.Quick(5, env_threads=1)
+    view.seed(7)
+    np.testing.assert_array_equal(view.reset(), cranes.reset(seed=7)[0])
+    rng, ends = np.random.default_rng(0), []
+    for _ in range(12):
+        actions = rng.uniform(-1, 1, (5, 6))
+        obs, reward, done, infos = view.step(actions)
+        expected, pay, terminated, truncated, info = cranes.step(actions)
+        np.testing.assert_array_equal(obs, expected)
+        np.testing.assert_allclose(reward, pay, rtol=1e-6)
+        assert (done == (terminated | truncated)).all() and reward.dtype == np.float32
+        for i, said in enumerate(infos):
+            assert bool(said) == done[i]
+            if done[i]:
+                ends.append(truncated[i])
+                np.testing.assert_array_equal(said["terminal_observation"], info["final_obs"][i])
+                assert said["TimeLimit.truncated"] == truncated[i]
+                assert said["is_success"] == info["success"][i]
+                assert said["termination"] == info["termination"][i]
+    assert len(ends) > len(set(ends)) == 2
+    view.set_attr("difficulty", 0.25)
+    assert view.envs.difficulty == 0.25 and view.get_attr("difficulty", [1]) == [0.25]
+    assert view.env_is_wrapped(VecMonitor) == [False] * 5
