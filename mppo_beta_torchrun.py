@@ -28,7 +28,6 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.distributions import Beta
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from crane_env import STRICT, Options
@@ -166,6 +165,8 @@ def compute_gae(
 
 
 if __name__ == "__main__":
+    from torch.utils.tensorboard import SummaryWriter  # not above: acting does without it
+
     all_args, checkpoint = runs.parse(Args, __doc__)
     if not dist.is_torchelastic_launched():
         raise SystemExit(f"start it as: torchrun --standalone --nproc-per-node 2 {__file__}")

@@ -36,7 +36,6 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.distributions import Normal
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from crane_env import STRICT, Options
@@ -163,6 +162,8 @@ def compute_gae(
 
 
 if __name__ == "__main__":
+    from torch.utils.tensorboard import SummaryWriter  # not above: acting does without it
+
     args, checkpoint = runs.parse(Args, __doc__)
     device = torch.device(args.device)
     batch_size = args.num_envs * args.num_steps
