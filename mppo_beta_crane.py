@@ -261,7 +261,7 @@ if __name__ == "__main__":
                 logratio = distribution.log_prob(b_actions[mb]).sum(-1) - b_logprobs[mb]
                 ratio = logratio.exp()
                 adv = b_advantages[mb]
-                adv = (adv - adv.mean()) / (adv.std() + 1e-8)
+                adv = (adv - adv.mean()) / (adv.std(correction=0) + 1e-8)
                 clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
                 policy_loss = -torch.min(adv * ratio, adv * clipped).mean()
                 value_loss = ((agent.get_value(b_obs[mb]) - b_returns[mb]) ** 2).mean()

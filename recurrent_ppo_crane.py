@@ -280,15 +280,14 @@ if __name__ == "__main__":
         stats = defaultdict(list)
         for _ in range(args.update_epochs):
             epoch_kls = []
-            cranes = torch.randperm(args.num_envs, device=device)
-            for mb in cranes.split(args.num_envs // args.num_minibatches):
+            for mb in torch.randperm(args.num_envs, device=device).chunk(args.num_minibatches):
                 mb_state = (first_state[0][mb], first_state[1][mb])
                 features, _ = agent.remember(obs[:, mb], mb_state, starts[:, mb])
                 distribution = agent.get_distribution(features)
                 logratio = distribution.log_prob(actions[:, mb]).sum(-1) - logprobs[:, mb]
                 ratio = logratio.exp()
                 adv = advantages[:, mb]
-                adv = (adv - adv.mean()) / (adv.std() + 1e-8)
+                adv = (adv - adv.mean()) / (adv.std(correction=0) + 1e-8)
                 clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
                 policy_loss = -torch.min(adv * ratio, adv * clipped).mean()
                 value_loss = ((agent.get_value(features) - returns[:, mb]) ** 2).mean()

@@ -157,7 +157,6 @@ class Agent(nn.Module):
 
 
 def flat(tensors: Iterable[Tensor]) -> Tensor:
-    """All elements in one vector."""
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
@@ -320,7 +319,8 @@ if __name__ == "__main__":
         b_advantages, b_returns = advantages.flatten(), (advantages + values).flatten()
 
         # Policy update: one step
-        adv = (b_advantages - b_advantages.mean()) / (b_advantages.std() + 1e-8)
+        adv = b_advantages - b_advantages.mean()
+        adv = adv / (adv.std(correction=0) + 1e-8)
         batch = (b_obs, b_actions, adv, old)
         surrogate, _ = surrogate_and_kl(agent, *batch)
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
@@ -334,9 +334,8 @@ if __name__ == "__main__":
         stats = defaultdict(list)
         stats["losses/policy_loss"].append(-(surrogate.item() + improvement))
         stats["losses/entropy"].append(old.entropy().sum(-1).mean().item())
-        stats["losses/approx_kl"].append(kl)
         stats["policy/std"].append(old.stddev.mean().item())
-        stats["trpo/step_fraction"].append(fraction)
+        stats["losses/approx_kl"], stats["trpo/step_fraction"] = [kl], [fraction]
 
         # Critic update
         for _ in range(args.update_epochs):

@@ -337,7 +337,7 @@ def test_wrong_arguments_are_refused_in_a_line_or_a_box(tmp_path, script):
         ("--env-id toy_tasks:BonusCrane-v0", "BonusCrane-v0 wraps a crane", "hook"),
         ("--env-id toy_tasks:Toy-v0 --env.contact sdf", "Toy-v0 is not the crane"),
     ]:
-        said = refusal(tmp_path, script, line)
+        said = refusal(tmp_path, script, f"{SMALL} --total-timesteps 32", line)
         assert all(word in said for word in words), said
     assert not (tmp_path / "runs").exists()
 
@@ -375,8 +375,9 @@ def test_python_without_docstrings_has_help(monkeypatch):
     ],
 )
 def test_what_is_not_finite_is_named(tmp_path, task, said):
+    line = f"{SMALL} --env-id toy_tasks:{task} --minibatch-size 16 --total-timesteps {UPDATE}"
     with pytest.raises(SystemExit, match=said):
-        Recording(tmp_path).run("ppo_crane", TOY, small("ppo_crane"), f"--env-id toy_tasks:{task}")
+        Recording(tmp_path).run("ppo_crane", line)
     assert not list(tmp_path.glob("runs/*/policy.pt"))
 
 
