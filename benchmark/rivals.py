@@ -1,21 +1,18 @@
 """What a user would pick instead, on the same cranes: mPPO and other libraries, 10 minutes each.
 
     pip install -r benchmark/requirements.txt
-    python benchmark/rivals.py                                  # all, 7 hours on two cores
+    python benchmark/rivals.py                                  # all, 6 hours on two cores
     python benchmark/rivals.py --rivals sb3_ppo sac --seeds 21  # some
     python benchmark/rivals.py --minutes 1.5 --results /tmp/rivals.csv    # does it work?
 
-Each run is a process of its own, whose start counts. Its clock stops while a policy is evaluated:
-every minute, the mean action in 120 trials of seed 10000. A finished run adds its rows to
-benchmark/results/rivals.csv and is not made again. A killed run leaves none.
+Each run is a process, whose start counts. Every minute its clock stops, and the mean action is
+evaluated in 120 trials of seed 10000. A finished run adds its rows to benchmark/results/rivals.csv
+and is not made again. A killed run leaves none.
 
 The `published` settings were made for other tasks: rl-baselines3-zoo's for PyBullet's HalfCheetah
-(SB3's PPO, SAC and TQC, sbx's PPO without gSDE), the example of sbx's README (its SAC), and Isaac
-Lab's for lifting a cube, with 64 environments (rsl-rl). `ours` is one try of ours, chosen before
-any result, with the reward scale, easy starts and repeated failures of mPPO.
-
-mPPO has its defaults. It saves a policy every 10 updates, so its evaluated policies are a little
-older than the clock says.
+(sbx's PPO without gSDE), and the example of sbx's README (its SAC). `ours` is one try of ours,
+chosen before any result, with the reward scale, easy starts and repeated failures of mPPO. mPPO
+itself has its defaults. It saves a policy every 10 updates, and such copies are evaluated.
 """
 
 import importlib
@@ -39,15 +36,17 @@ import numpy as np
 import torch
 import tyro
 from pydantic.dataclasses import dataclass
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from tqdm import tqdm
 
 from benchmark.runs import RESULTS, ROOT, read_rows, write_rows
 from crane_utils import runs, trials
+from crane_utils.sb3 import CraneVecEnv
 
 TASK, TRIALS, EVERY = "ForestryCrane-v0", 20, 60.0  # trials per log diameter; s between evaluations
 ENDLESS = 10**9  # steps or updates: the clock ends the training
-STARTED = "RIVALS_STARTED"  # environment variable of a run: time.time() before its process
+STARTED = "RIVALS_STARTED"  # environment variable of a run: time.monotonic() before its process
 
 
 class Setting(NamedTuple):
@@ -65,30 +64,27 @@ class TimeUp(Exception):
 class Clock:
     """Wall-clock time since the process was started, without the time of evaluations.
 
-    A training function sets act: mean actions (N, 6) for raw observations (N, 18).
+    A training function sets predict, as `trials.run_trials` wants it.
     """
 
     def __init__(self, minutes: float, threads: int):
         self.started, self.limit, self.threads = float(os.environ[STARTED]), 60 * minutes, threads
         self.next, self.evaluating, self.steps, self.rows = EVERY, 0.0, 0, []  # s
-        self.act: Callable[[np.ndarray], np.ndarray] | None = None
+        self.predict: Callable[..., tuple] | None = None
 
     def seconds(self) -> float:
-        return time.time() - self.started - self.evaluating
+        return time.monotonic() - self.started - self.evaluating
 
     def share(self) -> float:
         return min(1.0, self.seconds() / self.limit)
 
-    def predict(self, obs: np.ndarray, state: None = None, deterministic: bool = True) -> tuple:
-        return self.act(obs), None
-
     def evaluate(self, minutes: float, steps: int) -> None:
-        start = time.time()
+        start = time.monotonic()
         scores = trials.evaluate(self, TASK, TRIALS, threads=self.threads)
         rates = {name: round(100 * scores[f"{name}_rate"], 1) for name in ("success", "gentle")}
         self.rows.append({"minutes": round(minutes, 2), "steps": steps, **rates})
         tqdm.write(str(self.rows[-1]))
-        self.evaluating += time.time() - start
+        self.evaluating += time.monotonic() - start
 
 
 class TimedCranes(gymnasium.vector.VectorWrapper):
@@ -113,15 +109,11 @@ class TimedCranes(gymnasium.vector.VectorWrapper):
         return obs, reward * (0.06 if self.like_mppo else 1.0), *rest
 
 
-# ---- one training function per library
+# ---- trainings
 
 
 def train_sb3(algorithm: str, setting: Setting, seed: int, clock: Clock) -> None:
     """algorithm: module and class, of Stable-Baselines3, sb3-contrib or sbx."""
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    from crane_utils.sb3 import CraneVecEnv
-
     (module, name), options = algorithm.split(":"), deepcopy(setting.options)
     if setting.falling:
         start = options["learning_rate"]
@@ -133,41 +125,8 @@ def train_sb3(algorithm: str, setting: Setting, seed: int, clock: Clock) -> None
     envs = VecNormalize(envs, **setting.normalize or dict(norm_obs=False, norm_reward=False))
     maker = getattr(importlib.import_module(module), name)
     model = maker("MlpPolicy", envs, seed=seed, device="cpu", **options)
-    clock.act = lambda obs: model.predict(envs.normalize_obs(obs), deterministic=True)[0]
+    clock.predict = lambda obs, *_, **how: model.predict(envs.normalize_obs(obs), **how)
     model.learn(ENDLESS)
-
-
-def train_rsl_rl(_: str, setting: Setting, seed: int, clock: Clock) -> None:
-    """net: of actor and critic; std: of the actions at the start; steps: of a rollout."""
-    from rsl_rl.env import VecEnv
-    from rsl_rl.runners import OnPolicyRunner
-    from tensordict import TensorDict
-
-    def to_dict(obs: np.ndarray) -> TensorDict:
-        return TensorDict({"policy": torch.as_tensor(obs)}, [len(obs)])
-
-    class Cranes(VecEnv):
-        num_envs, num_actions, device, cfg = setting.cranes, 6, "cpu", {}
-
-        def get_observations(self) -> TensorDict:
-            return to_dict(envs.reset(seed=seed)[0])  # asked for only before the first step
-
-        def step(self, actions: torch.Tensor) -> tuple:
-            obs, reward, terminated, truncated, _ = envs.step(actions.numpy())
-            reward, done = torch.as_tensor(reward).float(), torch.as_tensor(terminated | truncated)
-            return to_dict(obs), reward, done, {"time_outs": torch.as_tensor(truncated)}
-
-    torch.manual_seed(seed)
-    envs, options = TimedCranes(setting, clock), deepcopy(setting.options)
-    net = {"class_name": "MLPModel", **options.pop("net")}
-    gaussian = {"class_name": "GaussianDistribution", "init_std": options.pop("std")}
-    config = {"num_steps_per_env": options.pop("steps"), "save_interval": ENDLESS}
-    config |= {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "critic": net}
-    config |= {"actor": {**net, "distribution_cfg": gaussian}}
-    runner = OnPolicyRunner(Cranes(), config | {"algorithm": {"class_name": "PPO", **options}})
-    policy = runner.alg.get_policy()  # it normalizes the observations itself
-    clock.act = lambda obs: policy(to_dict(obs)).detach().numpy()
-    runner.learn(ENDLESS)
 
 
 def train_mppo(_: str, setting: Setting, seed: int, clock: Clock) -> None:
@@ -184,8 +143,7 @@ def train_mppo(_: str, setting: Setting, seed: int, clock: Clock) -> None:
                 Path(f"{len(copies)}.pt").write_bytes(path.with_name("policy.pt").read_bytes())
         process.kill()
     for number, (minutes, steps) in enumerate(copies, 1):
-        agent = runs.load_policy(Path(f"{number}.pt"))[0]
-        clock.act = lambda obs, agent=agent: agent.predict(obs)[0]
+        clock.predict = runs.load_policy(Path(f"{number}.pt"))[0].predict
         clock.evaluate(minutes, steps)
 
 
@@ -211,14 +169,6 @@ OUR_SAC = dict(
     learning_rate=1e-3, buffer_size=500_000, gamma=0.97, tau=0.01, gradient_steps=8,
     learning_starts=5000, ent_coef="auto_0.1", policy_kwargs=dict(net_arch=[256, 256]),
 )  # fmt: skip
-RSL_RL = dict(
-    net=dict(hidden_dims=[256, 128, 64], activation="elu"), std=1.0, steps=24,
-    learning_rate=1e-4, num_learning_epochs=5, gamma=0.98, entropy_coef=0.006, desired_kl=0.01,
-)  # fmt: skip
-OUR_RSL_RL = dict(
-    net=dict(hidden_dims=[256, 256], activation="tanh", obs_normalization=True), std=0.3, steps=64,
-    learning_rate=1e-3, num_learning_epochs=8, gamma=0.97, entropy_coef=0.0, desired_kl=0.02,
-)  # fmt: skip
 SDE, ALL_STEPS = dict(use_sde=True, sde_sample_freq=4), dict(train_freq=64, gradient_steps=64)
 SBX_SAC = dict(learning_starts=10_000, train_freq=4, gradient_steps=4)
 ZOO_NORMALIZE, ONLY_OBS = dict(norm_reward=True, gamma=0.99), dict(norm_reward=False)
@@ -236,8 +186,6 @@ RIVALS = {  # how to train, module and class, and the settings
         "published": Setting(ZOO_PPO, 16, normalize=ZOO_NORMALIZE),
         "ours": Setting(OUR_PPO, 64, True, ONLY_OBS, falling=True)}),
     "sbx_sac": (train_sb3, "sbx:SAC", {"published": Setting(SBX_SAC, 1), "ours": OFF_POLICY}),
-    "rsl_rl_ppo": (train_rsl_rl, "",
-                   {"published": Setting(RSL_RL), "ours": Setting(OUR_RSL_RL, 64, True)}),
 }  # fmt: skip
 
 
@@ -278,7 +226,7 @@ def main() -> None:
         tqdm.write(" ".join(run))
         words = ["--rivals", name, "--settings", setting, "--seeds", str(seed), "--minutes", run[3]]
         words += ["--threads", str(args.threads), "--results", str(args.results.resolve())]
-        environment = os.environ | extra | {STARTED: str(time.time())}
+        environment = os.environ | extra | {STARTED: str(time.monotonic())}
         with tempfile.TemporaryDirectory() as folder:  # for what they write
             subprocess.run([sys.executable, __file__, *words], cwd=folder, env=environment)
     ends: dict[str, dict] = defaultdict(dict)

@@ -8,18 +8,10 @@ import torch
 EPS, BETA1, BETA2 = 1e-5, 0.9, 0.999  # of Adam
 
 SETTINGS = {  # of the compared runs
-    "num_steps": 9,
-    "update_epochs": 3,
-    "learning_rate": 0.02,
-    "gamma": 0.9,
-    "gae_lambda": 0.8,
-    "reward_scale": 0.5,
-    "target_kl": 0.0085,
-    "max_grad_norm": 1.5,
-    "narrowing": 0.3,
-    "horizon_growth": 2.0,
-    "curriculum": 0.5,
-}
+    "num_steps": 9, "update_epochs": 3, "learning_rate": 0.02, "gamma": 0.9, "gae_lambda": 0.8,
+    "reward_scale": 0.5, "target_kl": 0.0085, "max_grad_norm": 1.5, "narrowing": 0.3,
+    "horizon_growth": 2.0, "curriculum": 0.5,
+}  # fmt: skip
 CLIPPED = {"clip_coef": 0.1, "ent_coef": 0.05, "vf_coef": 0.7, "minibatch_size": 16}
 
 
@@ -294,7 +286,7 @@ class Reference:
         for batch in (batch for epoch in epochs for batch in epoch):
             losses = [(self.value(self.x[p]) - self.returns[p]) ** 2 for p in batch]
             norm = self.adam(sum(losses) / len(losses), critic)
-            stats.setdefault("losses/value_loss", []).append(float(sum(losses) / len(losses)))
+            stats.setdefault("losses/value_loss", []).append((sum(losses) / len(losses)).item())
             stats.setdefault("losses/grad_norm", []).append(norm)
         self.w["log_std"] = self.w["log_std"] - args["narrowing"] / args["iterations"]
         return stats

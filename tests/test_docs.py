@@ -90,6 +90,7 @@ def test_commands_parse(script, line, tmp_path, monkeypatch):
         runs.parse(importlib.import_module(script[:-3]).Args, "")
 
 
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
 def test_code_runs(page, tmp_path, monkeypatch, capsys):
     """Whole files in the page's order, in one folder: tasks train, and policies are judged."""

@@ -197,6 +197,16 @@ def test_start_distribution():
     assert np.abs(np.corrcoef(drawn) - np.eye(7)).max() < 0.06
 
 
+def test_a_whole_turn_of_the_slew_changes_no_angle():
+    """Also where the longer turn to the log is the better one."""
+    state = cranes(200).state()
+    angle = crane_env.relative_pose(state)[2]
+    assert angle.min() < -np.pi / 2 and angle.max() > np.pi / 2
+    for turn in (-2 * np.pi, 2 * np.pi):
+        turned = state._replace(q=state.q + turn * np.eye(8)[0])
+        np.testing.assert_allclose(crane_env.relative_pose(turned)[2], angle, atol=1e-9)
+
+
 # ---- rules and success
 
 

@@ -127,16 +127,8 @@ def test_evaluate_judges_the_full_task():
     _, seeds = trials.monte_carlo_trials(10_000, 2)
     results = trials.run_trials(Sway(), envs, seeds)
     assert scores.pop("episodic_return") == pytest.approx(results["episodic_return"].mean())
-    assert scores == {
-        "success_rate": 0.5,
-        "gentle_rate": pytest.approx(1 / 3),
-        "success_rate_0.3m": 0.0,
-        "success_rate_0.4m": 0.0,
-        "success_rate_0.5m": 0.0,
-        "success_rate_0.6m": 1.0,
-        "success_rate_0.7m": 1.0,
-        "success_rate_0.8m": 1.0,
-    }
+    rates = {f"success_rate_{d}m": float(d > 0.55) for d in trials.DIAMETERS}
+    assert scores == {"success_rate": 0.5, "gentle_rate": pytest.approx(1 / 3), **rates}
 
 
 def test_evaluate_other_tasks(monkeypatch, capsys):
@@ -339,6 +331,8 @@ def test_a_policy_that_does_not_fit_is_refused_in_a_line(judge, tmp_path, traine
     assert "Pendulum-v1 is not the crane" in refused(f"{trained} --env-id Pendulum-v1")
     assert "no nowhere.pt: give a run's folder" in refused("nowhere.pt")
     assert "no nowhere" in refused(f"{trained} nowhere")  # before the first trial
+    for line in ("--diameters 0.2", "--seed -1", "--env.frame-skip 0", "--warp 9"):
+        assert refused(f"zero {line}") == "2"  # and a box
     assert capsys.readouterr().out == ""
 
 
@@ -367,7 +361,7 @@ def test_shipped_policies_are_of_the_registered_tasks(path):
     agent, task, script = runs.load_policy(path)
     level = path.stem.partition("crane")[2].strip("_").title()
     assert task["env_id"] == f"ForestryCrane{level}-v0" and path.stem.startswith(script[:-3])
-    assert task["revision"] == trials.crane_class(task["env_id"]).REVISION
+    assert task["revision"] <= trials.crane_class(task["env_id"]).REVISION
     assert task["options"] == asdict(trials.task_options(task["env_id"]))
 
 

@@ -367,16 +367,11 @@ def test_python_without_docstrings_has_help(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "task, said",
-    [
-        ("NanReward-v0", "reward of environment 0 .*: nan"),
-        ("InfObs-v0", "observation .*0.*: .*inf"),
-    ],
-)
-def test_what_is_not_finite_is_named(tmp_path, task, said):
+@pytest.mark.parametrize("task", ["NanReward-v0", "InfObs-v0", "InfStart-v0"])
+def test_what_is_not_finite_is_named(tmp_path, task):
     line = f"{SMALL} --env-id toy_tasks:{task} --minibatch-size 16 --total-timesteps {UPDATE}"
-    with pytest.raises(SystemExit, match=said):
+    name = "reward" if "Reward" in task else "observation"
+    with pytest.raises(SystemExit, match=f"the {name} of environment 0 is not finite: .*(nan|inf)"):
         Recording(tmp_path).run("ppo_crane", line)
     assert not list(tmp_path.glob("runs/*/policy.pt"))
 

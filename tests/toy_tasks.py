@@ -54,7 +54,7 @@ class Recall(gymnasium.Env):
 
 
 class Odd(gymnasium.Env):
-    """Step `at` gives an observation or a reward that is not finite. Never ends by itself."""
+    """Step `at` (0: the start) gives an observation or a reward that is not finite. No end."""
 
     observation_space = Box(-np.inf, np.inf, (2,), np.float32)
 
@@ -65,7 +65,7 @@ class Odd(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.steps = 0
-        return np.zeros(2, np.float32), {}
+        return np.array([self.odd[0] if self.at == 0 else 0.0, 0.0], np.float32), {}
 
     def step(self, action):
         self.steps += 1
@@ -104,6 +104,7 @@ gymnasium.register("Endless-v0", Odd, max_episode_steps=5)
 gymnasium.register("NoEnd-v0", Odd)
 gymnasium.register("Unbounded-v0", Odd, max_episode_steps=5, kwargs={"bound": np.inf})
 gymnasium.register("NanReward-v0", Odd, 5, kwargs={"at": 3, "reward": np.nan})
+gymnasium.register("InfStart-v0", Odd, max_episode_steps=5, kwargs={"at": 0, "obs": np.inf})
 gymnasium.register("InfObs-v0", Odd, max_episode_steps=5, kwargs={"at": 3, "obs": np.inf})
 gymnasium.register("Quick-v0", vector_entry_point=Quick)
 gymnasium.register("BonusCrane-v0", bonus_crane)

@@ -1,0 +1,145 @@
+"""Evaluate policies on cranes that they were not trained on.
+
+    python benchmark/robustness.py levels     # results/levels.csv: the other levels
+    python benchmark/robustness.py changes    # results/robustness.csv: a hydraulic crane, changed
+    python benchmark/robustness.py changes --trials 1 --folder /tmp/test    # does it work?
+
+The policies are the shipped ones and the scripted crane. Rows that a file has are not measured
+again: if a policy has changed, delete the file. `figures.py robustness` draws the changes.
+"""
+
+import sys
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+import eval_crane
+from benchmark.runs import LABELS, LEVELS, METRICS, RESULTS, ROOT, read_rows, write_rows
+from crane_env import ACTION_OF_SERVO, SERVOS
+from crane_utils import runs
+from crane_utils.trials import REPORT_SEED, task_options
+from hydraulic_crane import PUMP_FLOW, HydraulicCraneVectorEnv, oil_per_movement
+from scripted_crane import ScriptedCrane
+
+METHODS = {label: script for script, label in LABELS.items()} | {"scripted": "scripted"}
+CHANGES = {  # attribute of ChangedCranes: what the tables call it, and its values
+    "delay": ("more dead time [s]", [0.0, 0.03, 0.06, 0.09, 0.12]),
+    "pose_error": ("constant pose error [m]", [0.0, 0.05, 0.1, 0.15, 0.2, 0.3]),
+    "swing_damping": ("passive damping, times", [0.25, 0.5, 1.0, 2.0, 5.0, 10.0]),
+    "pump": ("pump, times", [0.4, 0.6, 0.8, 1.0]),
+    "force": ("force limits, times", [0.4, 0.6, 0.8, 1.0]),
+    "slope": ("slope of the ground [deg]", [0.0, 2.0, 4.0, 6.0]),
+    "friction": ("friction, times", [0.4, 0.6, 0.8, 1.0, 1.4]),
+    "density": ("density of the log [kg/m^3]", [450.0, 650.0, 850.0, 1050.0]),
+}
+
+
+class ChangedCranes(HydraulicCraneVectorEnv):
+    """Hydraulic cranes. A subclass gives one of these attributes another value."""
+
+    delay = 0.0  # s, more dead time of all drives
+    pose_error = 0.0  # m, to a side that each crane keeps, of the log's reported place
+    swing_damping = 1.0  # factor on the damping of q5 and q6
+    pump = 1.0  # factor on its flow, 1 at most
+    force = 1.0  # factor on the force limits
+    slope = 0.0  # degrees, of a ground that falls along x
+    friction = 1.0  # factor
+    density = 650.0  # kg/m^3
+
+    def __init__(self, num_envs: int = 1, **kwargs: Any):
+        density = self.density
+        super().__init__(num_envs, **kwargs)  # has an array of this name
+        self.drawn["density"][:], self.drawn["friction"][:] = density, self.friction
+        side = np.random.default_rng(0).uniform(0, 2 * np.pi, num_envs)
+        error = [np.cos(side), np.sin(side), 0 * side]
+        self.drawn["pose_error"] = self.pose_error * np.stack(error, axis=-1)
+
+    def make_spec(self) -> mujoco.MjSpec:
+        spec = super().make_spec()
+        for index in SERVOS:
+            joint = spec.joints[index]
+            joint.actfrcrange *= self.force
+            drive = spec.actuator(f"{joint.name}_integral")
+            drive.delay, drive.nsample = drive.delay + self.delay, 2 * drive.nsample
+        for name in ("q5", "q6"):
+            spec.joint(name).damping[0] *= self.swing_damping
+        angle, g = np.radians(self.slope), spec.option.gravity[2]
+        spec.option.gravity = [-g * np.sin(angle), 0, g * np.cos(angle)]
+        return spec
+
+    def oil_speed(self, ids: np.ndarray, command: np.ndarray, seconds: float) -> np.ndarray:
+        speed = super().oil_speed(ids, command, seconds)
+        force = self.spring_force()[ids] @ np.eye(6)[ACTION_OF_SERVO]
+        flow = oil_per_movement(self.levers[:, ids], speed, force) * np.abs(speed)
+        flow = np.maximum(flow.sum(axis=-1, keepdims=True), 1e-9)
+        return speed * np.minimum(1, self.pump * PUMP_FLOW / flow)
+
+
+def policy_of(method: str, level: str) -> tuple[Any, int]:
+    """The shipped policy of a method and a level, and the seed of its training."""
+    if method == "scripted":
+        return ScriptedCrane(), 1
+    name = METHODS[method] + f"_{level}" * (level != "ideal")
+    path = ROOT / "assets" / "policies" / f"{name}.pt"
+    return runs.load_policy(path)[0], runs.load(path)["args"]["seed"]
+
+
+def add_row(path: Path, key: dict, policy: Any, trained_on: str, env_id: str) -> None:
+    """Success and metrics of a policy, in trials of seed 60000. A row that is there stays."""
+    trials = key["per_diameter"]
+    key |= {"trial_seed": REPORT_SEED, "trials": 6 * trials}
+    key = {name: str(value) for name, value in key.items()}
+    known, options = read_rows(path), task_options(env_id)
+    if any(key.items() <= row.items() for row in known):
+        return
+    if trained_on == "ideal" and hasattr(options, "sensors"):
+        options = replace(options, sensors=False)
+    args = eval_crane.Args(seed=REPORT_SEED, trials=trials)
+    line = eval_crane.summarize([*eval_crane.play(policy, env_id, options, args)], {})
+    line |= {"success": line["success %"], "gentle": line["gentle %"]}
+    for name in ("success", "gentle", *METRICS):
+        key[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
+    write_rows(path, [*known, key])
+
+
+def levels(trials: int = 100, folder: Path = RESULTS) -> None:
+    """Write levels.csv: policies on the other levels, with so many trials per log diameter."""
+    for method, trained_on, level in tqdm([*product(METHODS, LEVELS, LEVELS)], unit="row"):
+        if (method, trained_on) == ("scripted", "randomized"):
+            continue  # it is the hydraulic one
+        if level == "ideal" and trained_on != "ideal":
+            continue  # too few sensors
+        policy, seed = policy_of(method, trained_on)
+        key = {"method": method, "trained_on": trained_on, "seed": seed, "evaluated_on": level}
+        key["per_diameter"] = trials
+        add_row(folder / "levels.csv", key, policy, trained_on, LEVELS[level])
+
+
+def changes(trials: int = 25, folder: Path = RESULTS) -> None:
+    """Write robustness.csv: policies on hydraulic cranes with one of CHANGES."""
+    policies = {method: policy_of(method, "hydraulic")[0] for method in METHODS}
+    policies["mPPO, made for randomized"], _ = policy_of("mPPO", "randomized")
+    points = [(name, label, x) for name, (label, xs) in CHANGES.items() for x in xs]
+    for attribute, label, value in tqdm(points, unit="change"):
+        env_id = f"Changed-{attribute}-{str(value).replace('.', '-')}-v0"
+        cranes = type("Cranes", (ChangedCranes,), {attribute: value})
+        gymnasium.register(env_id, vector_entry_point=cranes)
+        for method, policy in policies.items():
+            key = {"method": method, "changed": label, "value": value, "per_diameter": trials}
+            add_row(folder / "robustness.csv", key, policy, "hydraulic", env_id)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    commands = {"levels": levels, "changes": changes}
+    tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)

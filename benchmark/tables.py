@@ -1,0 +1,242 @@
+"""Fill the tables of README.md and docs/ from the CSV files, and check the leaderboard.
+
+    python benchmark/tables.py
+    python benchmark/tables.py --check --method "My method"
+
+A table stands between <!-- name --> and <!-- end -->. The function of that name makes it.
+
+--check evaluates policies of benchmark/results/leaderboard.csv in 600 trials of seed 60000. It
+fills in scores that are missing, or of an earlier revision of the level. It fails where another one
+differs by more than a percentage point.
+"""
+
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from benchmark import runs
+from benchmark.runs import LABELS, LEVELS, RESULTS, Curve, read_curves, read_rows
+from crane_utils.trials import DIAMETERS, crane_class
+from eval_crane import PAPER
+
+DOCUMENTS = [runs.ROOT / "README.md", *sorted((runs.ROOT / "docs").glob("*.md"))]
+PAPER_MEANS = {noise: f"{np.mean([*of_d.values()]):.1f}" for noise, of_d in PAPER.items()}
+TOLERANCE = 1.0  # percentage points, six trials of 600: weights round differently elsewhere
+
+
+def table(header: list[str], lines: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["--"] * len(header), *lines])
+
+
+def evaluations(script: str, level: str, noise: str = "none") -> list[dict[str, str]]:
+    """The rows of a script's runs on a level, one a seed."""
+    run = f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
+    rows = read_rows(RESULTS / "evaluations.csv")
+    return [row for row in rows if (row["run"], row["pose_noise"]) == (run, noise)]
+
+
+def numbers(rows: list[dict[str, str]], column: str) -> list[float]:
+    """A column, NaN where it is empty."""
+    return [float(row[column] or "nan") for row in rows]
+
+
+def joined(values: Iterable[float], digits: int, missing: str = "never") -> str:
+    """One number a seed."""
+    return ", ".join(missing if np.isnan(x) else f"{x:.{digits}f}" for x in values)
+
+
+def results() -> str:
+    """evaluations.csv: mean, lowest and highest of the seeds. leaderboard.csv: scripted crane."""
+    levels, lines = ["hydraulic", "randomized", "ideal"], []
+    for script in LABELS:
+        cells = []
+        for level in levels:
+            rows = evaluations(script, level)
+            for score in (numbers(rows, "success"), numbers(rows, "gentle")):
+                cells.append(f"{np.mean(score):.1f} ({min(score):.1f}–{max(score):.1f})")
+        lines.append([f"`{script}.py`", *cells])
+    scripted = {row["level"]: row for row in newest() if row["method"] == "scripted"}
+    both = ("success_exact", "gentle_exact")
+    cells = [scripted.get(level, {}).get(score, "") for level in levels for score in both]
+    lines.append(["`scripted_crane.py`, no learning", *cells])
+    lines.append(["paper, mPPO", "", "", "", "", PAPER_MEANS["none"], ""])
+    return table(["policy", *[head for level in levels for head in (level, "gentle")]], lines)
+
+
+def seeds() -> str:
+    """evaluations.csv: success, gentle success and metrics of each training seed."""
+    lines, curves = [], read_curves("curves") | read_curves("levels")
+    for level in LEVELS:
+        for script, method in LABELS.items():
+            if not (rows := evaluations(script, level)):
+                continue
+            of_seed = curves.get(script if level == "ideal" else f"{script}_{level}", {})
+            steps = dict.fromkeys(f"{run['steps'][-1] / 1e6:.2f}" for run in of_seed.values())
+            line = [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)]
+            for score in (numbers(rows, "success"), numbers(rows, "gentle")):
+                line += [joined(score, 1), f"{np.mean(score):.1f}"]
+            metrics = ("energy [kJ]", "up [s]")
+            lines.append(line + [joined(numbers(rows, name), 1, "-") for name in metrics])
+    header = ["level", "method", "steps [million]", "seeds", "success", "mean", "gentle", "mean"]
+    return table([*header, "energy [kJ]", "up [s]"], lines)
+
+
+def steps_to(run: Curve, level: float) -> float:
+    """Million steps, between two evaluations, where success first reaches a level, or NaN."""
+    success, steps = run["eval_success_rate"], run["steps"]
+    row = np.argmax(success >= level)
+    if success[row] < level:
+        return np.nan
+    return np.interp(level, success[: row + 1][-2:], steps[: row + 1][-2:]) / 1e6
+
+
+def learning() -> str:
+    """curves/: when the four algorithms learn, and the return at the end."""
+    lines, curves = [], read_curves("curves")
+    for script, label in LABELS.items():
+        of_seed = curves[script].values()
+        cells = [joined([steps_to(run, level) for run in of_seed], 2) for level in (0.5, 0.9)]
+        returns = [run["eval_episodic_return"][-1] for run in of_seed]
+        lines.append([label, *cells, joined(returns, 0)])
+    header = ["half of the trials succeed after [million steps]", "nine tenths succeed after"]
+    return table(["method", *header, "return of the mean action at the end"], lines)
+
+
+def paper() -> str:
+    """The paper's Tables I and II beside evaluations.csv: mPPO's first seed."""
+    ours = {noise: evaluations("mppo_beta_crane", "ideal", noise)[0] for noise in PAPER}
+    lines = []
+    for d in DIAMETERS:
+        cells = [[str(PAPER[noise][d]), f"{float(ours[noise][f'{d} m']):.0f}"] for noise in PAPER]
+        lines.append([str(d), *cells[0], *cells[1]])
+    means = [[PAPER_MEANS[noise], f"{float(ours[noise]['success']):.1f}"] for noise in PAPER]
+    lines.append(["mean", *means[0], *means[1]])
+    return table(["d [m]", "paper, Table I", "here", "paper, Table II", "here"], lines)
+
+
+def costs() -> str:
+    """levels.csv: metrics of the shipped policies and the scripted crane on their own levels."""
+    metrics, lines = ["oil [l]", "energy [kJ]", "up [s]", "swing [rad]"], []
+    for row in read_rows(RESULTS / "levels.csv"):
+        if row["trained_on"] == row["evaluated_on"]:
+            cells = [f"{float(row[name]):.3g}" if row[name] else "" for name in metrics]
+            lines.append([row["trained_on"], row["method"], *cells])
+    lines.sort(key=lambda line: [*LEVELS].index(line[0]))
+    return table(["level", "method", *metrics], lines)
+
+
+def timed() -> str:
+    """timed/: trainings alone on two cores. A success that is kept never falls below 95 % again."""
+    lines, curves = [], read_curves("timed")
+    for level in LEVELS:
+        name = "mppo_beta_crane" + f"_{level}" * (level != "ideal")
+        for seed, run in curves.get(name, {}).items():
+            success, minutes = run["eval_success_rate"], run["minutes"]
+            kept = [
+                minutes[k]
+                for k in range(len(success) - 1)
+                if success[k] >= 0.963 and success[k:].min() >= 0.95
+            ]
+            cells = [joined([x], 1) for x in (minutes[-1], kept[0] if kept else np.nan)]
+            cells = [f"{run['steps'][-1] / 1e6:.2f}", *cells, f"{100 * success[-1]:.1f}"]
+            lines.append([level, str(seed), *cells])
+    header = ["level", "seed", "steps [million]", "training [min]", "96.3 % kept after [min]"]
+    return table([*header, "success at the end [%]"], lines)
+
+
+def speed() -> str:
+    """throughput.csv: the ratios, a column a frame skip."""
+    ratios: dict[str, dict[str, str]] = defaultdict(dict)
+    for row in read_rows(RESULTS / "throughput.csv"):
+        if row["part"] == "ratio":
+            ratios[row["what"]][row["skip"]] = f"{float(row['median']):.2f}"
+    lines = [[name, *[of.get(skip, "") for skip in ("20", "1")]] for name, of in ratios.items()]
+    return table(["ratio", "skip 20", "skip 1"], lines)
+
+
+def newest() -> list[dict[str, str]]:
+    """The leaderboard's rows, without those of a level's earlier revision."""
+    rows = [row for row in read_rows(RESULTS / "leaderboard.csv") if row["revision"]]
+    rows.sort(key=lambda row: int(row["revision"]))
+    revision = {row["level"]: row["revision"] for row in rows}
+    return [row for row in rows if row["revision"] == revision[row["level"]]]
+
+
+def leaderboard() -> str:
+    """leaderboard.csv: means over the seeds of each method, level by level, the best first."""
+    of_method = defaultdict(list)
+    for row in newest():
+        of_method[row["level"], row["method"]].append(row)
+    lines = []
+    for (level, method), rows in of_method.items():
+        scores = ("gentle_exact", "success_exact", "gentle_pose_errors", "success_pose_errors")
+        means = [f"{np.mean(numbers(rows, score)):.1f}" for score in scores]
+        lines.append([level, method, *means, str(len(rows)), rows[0]["training"]])
+    lines.sort(key=lambda line: ([*LEVELS].index(line[0]), -float(line[2])))
+    header = ["level", "method", "gentle %", "success %", "gentle, with pose errors"]
+    return table([*header, "success, with pose errors", "number of seeds", "training"], lines)
+
+
+ALL = (results, seeds, learning, paper, costs, timed, speed, leaderboard)
+TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
+
+
+def filled(text: str) -> str:
+    """The document with today's tables. KeyError names a table that nobody makes."""
+
+    def fill(found: re.Match) -> str:
+        return f"<!-- {found[1]} -->\n{TABLES[found[1]]()}\n<!-- end -->"
+
+    return re.sub(r"<!-- (\w+) -->.*?<!-- end -->", fill, text, flags=re.DOTALL)
+
+
+def differences(method: str) -> list[str]:
+    """Evaluate policies again and fill in missing scores. A line for each that differs."""
+    path, wrong = RESULTS / "leaderboard.csv", []
+    chosen = [row for row in read_rows(path) if method in ("", row["method"])]
+    if not chosen:
+        raise SystemExit(f"the leaderboard has no method {method!r}")
+    for row in tqdm(chosen, unit="row"):
+        key = {name: row[name] for name in ("method", "level", "training_seed")}
+        label = f"{row['method']} on {row['level']}, seed {row['training_seed']}"
+        now = {"revision": str(crane_class(LEVELS[row["level"]]).REVISION)}
+        for name, noise in (("exact", "none"), ("pose_errors", "step")):
+            scores = runs.evaluate(row["policy"], noise, "--env-id", LEVELS[row["level"]])
+            now |= {f"{what}_{name}": f"{scores[what]:.1f}" for what in ("success", "gentle")}
+        if row["success_exact"] == "" or row["revision"] != now["revision"]:
+            rows = read_rows(path)  # again: evaluations take minutes
+            rows = [old | now if key.items() <= old.items() else old for old in rows]
+            runs.write_rows(path, rows)
+            continue
+        for name, value in now.items():
+            if abs(float(value) - float(row[name])) > TOLERANCE + 1e-9:
+                wrong.append(f"{label}: {name} is {value}, the row says {row[name]}")
+    return wrong
+
+
+def main(check: bool = False, method: str = "") -> None:
+    """Fill the tables.
+
+    Args:
+        check: evaluate the leaderboard's policies first; their paths begin in the repository
+        method: check the rows of this method only
+    """
+    wrong = differences(method) if check else []
+    for path in DOCUMENTS:
+        text = path.read_text(encoding="utf-8")
+        if (new := filled(text)) != text:
+            path.write_text(new, encoding="utf-8", newline="\n")
+            print(f"filled {path}")
+    sys.exit("\n".join(wrong) or 0)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
