@@ -2,6 +2,7 @@
 
     python benchmark/robustness.py levels     # results/levels.csv: the other levels
     python benchmark/robustness.py changes    # results/robustness.csv: a hydraulic crane, changed
+    python benchmark/robustness.py held       # results/held.csv: ten more seconds without command
     python benchmark/robustness.py changes --trials 1 --folder /tmp/test    # does it work?
 
 The policies are the shipped ones and the scripted crane. Rows that a file has are not measured
@@ -25,9 +26,16 @@ from tqdm import tqdm
 
 import eval_crane
 from benchmark.runs import LABELS, LEVELS, METRICS, RESULTS, ROOT, read_rows, write_rows
-from crane_env import ACTION_OF_SERVO, SERVOS
+from crane_env import ACTION_OF_SERVO, SERVOS, CraneVectorEnv
 from crane_utils import runs
-from crane_utils.trials import REPORT_SEED, task_options
+from crane_utils.trials import (
+    REPORT_SEED,
+    crane_class,
+    make_envs,
+    monte_carlo_trials,
+    run_trials,
+    task_options,
+)
 from hydraulic_crane import PUMP_FLOW, HydraulicCraneVectorEnv, oil_per_movement
 from scripted_crane import ScriptedCrane
 
@@ -139,7 +147,38 @@ def changes(trials: int = 25, folder: Path = RESULTS) -> None:
             add_row(folder / "robustness.csv", key, policy, "hydraulic", env_id)
 
 
+class ThenStill:
+    """A policy for 9 s, and then no command. safe: whose log was up and held after those 9 s."""
+
+    def __init__(self, policy: Any, cranes: CraneVectorEnv):
+        self.policy, self.cranes = policy, cranes
+
+    def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True) -> tuple:
+        step, memory = state or (0, None)
+        actions, memory = self.policy.predict(obs, memory, deterministic=deterministic)
+        if step == 90:
+            held = [s >= self.cranes.hold_steps for s in self.cranes.streaks.values()]
+            self.safe = np.all(held, axis=0) & (self.cranes.steps == step)
+        return actions * (step < 90), (step + 1, memory)
+
+
+def held(trials: int = 100, folder: Path = RESULTS) -> None:
+    """Write held.csv: success after 9 s, and after ten more seconds without command."""
+    for method, level in tqdm([*product(METHODS, LEVELS)], unit="row"):
+        cranes = crane_class(LEVELS[level])
+        env_id, kwargs = f"Held-{level}-v0", gymnasium.spec(LEVELS[level]).kwargs
+        longer = type("Longer", (cranes,), {"TIME_LIMIT": 19.0})
+        gymnasium.register(env_id, vector_entry_point=longer, kwargs=kwargs)
+        diameters, seeds = monte_carlo_trials(REPORT_SEED, trials)
+        envs = make_envs(env_id, len(seeds), diameter=diameters)
+        policy = ThenStill(policy_of(method, level)[0], envs.unwrapped)
+        end = run_trials(policy, envs, seeds)["success"] & policy.safe
+        key = {"method": method, "level": level, "trial_seed": REPORT_SEED, "trials": len(seeds)}
+        key |= {"success": f"{100 * policy.safe.mean():.4g}", "held": f"{100 * end.mean():.4g}"}
+        write_rows(folder / "held.csv", [*read_rows(folder / "held.csv"), key])
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    commands = {"levels": levels, "changes": changes}
+    commands = {"levels": levels, "changes": changes, "held": held}
     tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)
