@@ -79,7 +79,7 @@ ABLATIONS = {  # what it is in the figure, script and flags
     "gaussian": ("Gaussian policy, not perturbed", PPO,
                  "--learning-rate 1e-3 --narrowing 0.83 --retry 0.5"),
     "offset_minus": ("diameter's offset subtracted", MPPO, "--env.offset minus"),
-    "unsigned_yaw": ("angle to the log without its sign", MPPO, "--env.no-signed-yaw"),
+    "unsigned_yaw": ("angle to the log without its sign", MPPO, "--env.signed-yaw False"),
     "axes_world": ("log's place along the world's axes", MPPO, "--env.axes world"),
     "retry_none": ("failed starts not repeated", MPPO, "--retry 0"),
     "curriculum_none": ("full task from the start", MPPO, "--curriculum 0"),
@@ -163,9 +163,14 @@ def export(folder: Path) -> list[dict[str, float]]:
     return [rows[step] for step in sorted(rows)]
 
 
+def number(cell: float | str) -> float:
+    return np.nan if cell == "" else float(cell)
+
+
 def curve(rows: list[dict]) -> Curve:
     """A run's rows with an evaluation, and the minutes of rollouts and updates until then."""
-    run = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
+    cells = {name: [row[name] for row in rows] for name in rows[0]}
+    run = {name: np.array([*map(number, column)]) for name, column in cells.items()}
     seconds = np.diff(run["steps"], prepend=0) / run["SPS"]
     seconds[seconds > 10 * np.median(seconds)] = np.median(seconds)  # it was suspended
     run["minutes"] = np.cumsum(seconds) / 60

@@ -44,8 +44,7 @@ def evaluations(script: str, level: str, noise: str = "none") -> list[dict[str, 
 
 
 def numbers(rows: list[dict[str, str]], column: str) -> list[float]:
-    """A column, NaN where it is empty."""
-    return [float(row[column] or "nan") for row in rows]
+    return [runs.number(row[column]) for row in rows]
 
 
 def joined(values: Iterable[float], digits: int, missing: str = "never") -> str:
