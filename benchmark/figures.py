@@ -5,7 +5,6 @@ python benchmark/figures.py curves           # or another one of the repository'
 """
 
 import sys
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +84,10 @@ def learning_curves(lines: dict[str, list[Curve]], path: Path) -> None:
 
 
 def run(paths: Positional[tuple[Path, ...]], figure: Path = Path("curves.svg")) -> None:
-    """Draw the learning curves of runs on the crane.
+    """Draw the learning curves of runs on the crane; those with the same task and name are one.
 
     Args:
-        paths: folders of runs, or CSV files of benchmark/results/. Runs with the same name and
-            task are one curve, which ends where the shortest of them ends
+        paths: folders of runs, or CSV files of benchmark/results/
         figure: file to write, .svg, .png or .pdf
     """
     lines: dict[str, list[Curve]] = {}
@@ -142,22 +140,17 @@ def robustness() -> None:
     for row in read_rows(RESULTS / "robustness.csv"):
         point = float(row["value"]), float(row["success"])
         lines.setdefault(row["changed"], {}).setdefault(row["method"], []).append(point)
-    figure, axes = plt.subplots(-(-len(lines) // 4), 4, figsize=(12, 6), sharey=True)
-    for axis, (change, of_method) in zip_longest(axes.flat, lines.items(), fillvalue=("", {})):
+    rows = -(-len(lines) // 4)
+    figure = plt.figure(figsize=(12, 3 * rows))
+    for k, (change, of_method) in enumerate(lines.items()):
+        axis = figure.add_subplot(rows, 4, k + 1, xlabel=change, ylim=(0, 102))
+        axis.set_ylabel("" if k % 4 else "success [%]")
         for method, points in of_method.items():
             axis.plot(*zip(*sorted(points)), "o-", markersize=4, label=method)
-        axis.set_xlabel(change)
-        axis.set_ylim(0, 102)
         axis.grid(alpha=0.3)
         axis.set_xscale("log" if change.startswith("passive") else "linear")
-        axis.set_visible(bool(of_method))
-    figure.supylabel("success [%]")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(),
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0.03),
-        ncols=6,
-    )
+    handles = axis.get_legend_handles_labels()
+    figure.legend(*handles, loc="upper center", bbox_to_anchor=(0.5, 0.03), ncols=6)
     figure.subplots_adjust(hspace=0.3)
     save(figure, FIGURES / "robustness.svg")
 
@@ -217,8 +210,8 @@ def pictures(policy: str, diameter: float) -> list[Image.Image]:
     """A labelled picture after each step of a trial of seed 60000."""
     agent, task, _ = eval_crane.load_policy(policy)
     look = {"render_mode": "rgb_array", "width": 400, "height": 300, "decorate": decorate}
-    own = {"diameter": diameter, "autoreset": False}
-    crane = trials.make_envs(task["env_id"], 1, 1, task["options"] | look | own).unwrapped
+    how = task["options"] | look | {"diameter": diameter, "autoreset": False}
+    crane = trials.make_envs(task["env_id"], 1, 1, how).unwrapped
     seed = trials.monte_carlo_trials(trials.REPORT_SEED, 2, [diameter])[1][1]
     obs, state, taken = crane.reset(seed=[seed])[0], None, []
     for step in tqdm(range(crane.max_steps + 1), unit="picture"):

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Train by the paper's protocol (Vu et al., Sec. V), as far as it is stated. This takes days.
 #
-#     benchmark/paper.sh                      # mppo_beta; or ppo, trpo, recurrent_ppo
+#     benchmark/paper.sh mppo_beta            # or ppo, trpo, recurrent_ppo
 #     benchmark/paper.sh ppo --threads 16     # further arguments go to the script
 #     benchmark/paper.sh ppo --resume runs/<run>
 #     benchmark/paper.sh ppo --total-timesteps 84000 --final-trials 1    # does it work?
@@ -20,11 +20,8 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-algorithm=mppo_beta
-if [[ $# -gt 0 && $1 != -* ]]; then
-    algorithm=$1
-    shift
-fi
+algorithm=${1:?mppo_beta, ppo, trpo or recurrent_ppo}
+shift
 flags=(
     --env-id ForestryCranePaper-v0 --curriculum 0 --retry 0 --horizon-growth 1 --narrowing 0
     --total-timesteps 500000000 --num-envs 42 --num-steps 1000 --hidden-sizes 256 256 256 256

@@ -9,10 +9,9 @@ Each run is a process, whose start counts. Every minute its clock stops, and the
 evaluated in 120 trials of seed 10000. A finished run adds its rows to benchmark/results/rivals.csv
 and is not made again. A killed run leaves none.
 
-The `published` settings were made for other tasks: rl-baselines3-zoo's for PyBullet's HalfCheetah
-(sbx's PPO without gSDE), and the example of sbx's README (its SAC). `ours` is one try of ours,
-chosen before any result, with the reward scale, easy starts and repeated failures of mPPO. mPPO
-itself has its defaults. It saves a policy every 10 updates, and such copies are evaluated.
+`published` settings were made for other tasks: rl-baselines3-zoo's for PyBullet's HalfCheetah (PPO
+of sbx without gSDE), and the example of sbx's README (its SAC). `ours` is one try, chosen before
+any result, with mPPO's reward scale, easy starts and repeated failures. mPPO has its defaults.
 """
 
 import importlib
@@ -151,24 +150,20 @@ def train_mppo(_: str, setting: Setting, seed: int, clock: Clock) -> None:
 
 ZOO_PPO = dict(
     n_steps=512, batch_size=128, n_epochs=20, learning_rate=3e-5, gamma=0.99, gae_lambda=0.9,
-    clip_range=0.4, policy_kwargs=dict(
-        log_std_init=-2, ortho_init=False, activation_fn=nn.ReLU, net_arch=[256, 256]
-    ),
-)  # fmt: skip
+    clip_range=0.4, policy_kwargs=dict(log_std_init=-2, ortho_init=False, activation_fn=nn.ReLU,
+                                       net_arch=[256, 256]))  # fmt: skip
 ZOO_SAC = dict(
     learning_rate=7.3e-4, buffer_size=300_000, gamma=0.98, tau=0.02, train_freq=8, gradient_steps=8,
-    learning_starts=10_000, use_sde=True, policy_kwargs=dict(log_std_init=-3, net_arch=[400, 300]),
-)  # fmt: skip
+    learning_starts=10_000, use_sde=True,
+    policy_kwargs=dict(log_std_init=-3, net_arch=[400, 300]))  # fmt: skip
 OUR_PPO = dict(
     n_steps=64, batch_size=1024, n_epochs=8, learning_rate=1e-3, gamma=0.97,
-    policy_kwargs=dict(log_std_init=-1.2, net_arch=[256, 256]),
-)  # fmt: skip
+    policy_kwargs=dict(log_std_init=-1.2, net_arch=[256, 256]))  # fmt: skip
 # With 32 cranes this is one gradient step for four steps: more would leave few steps. An entropy
 # weight that starts at 1 would outweigh the scaled reward.
 OUR_SAC = dict(
     learning_rate=1e-3, buffer_size=500_000, gamma=0.97, tau=0.01, gradient_steps=8,
-    learning_starts=5000, ent_coef="auto_0.1", policy_kwargs=dict(net_arch=[256, 256]),
-)  # fmt: skip
+    learning_starts=5000, ent_coef="auto_0.1", policy_kwargs=dict(net_arch=[256, 256]))  # fmt: skip
 SDE, ALL_STEPS = dict(use_sde=True, sde_sample_freq=4), dict(train_freq=64, gradient_steps=64)
 SBX_SAC = dict(learning_starts=10_000, train_freq=4, gradient_steps=4)
 ZOO_NORMALIZE, ONLY_OBS = dict(norm_reward=True, gamma=0.99), dict(norm_reward=False)
@@ -216,8 +211,7 @@ def main() -> None:
         return run_here(args)
     if hasattr(os, "sched_setaffinity"):  # jax takes all cores that it finds
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: args.threads])
-    extra = {"OMP_NUM_THREADS": str(args.threads), "JAX_PLATFORMS": "cpu"}
-    extra["GOMP_SPINCOUNT"] = "5000"  # as our scripts have it
+    extra = {"OMP_NUM_THREADS": str(args.threads), "JAX_PLATFORMS": "cpu", "GOMP_SPINCOUNT": "5000"}
     for seed, name, setting in tqdm([*product(args.seeds, args.rivals, args.settings)]):
         run = [name, setting, str(seed), str(args.minutes)]
         done = [[*row.values()][:4] for row in read_rows(args.results)]

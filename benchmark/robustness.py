@@ -13,6 +13,7 @@ import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -26,16 +27,10 @@ from tqdm import tqdm
 
 import eval_crane
 from benchmark.runs import LABELS, LEVELS, METRICS, RESULTS, ROOT, read_rows, write_rows
-from crane_env import ACTION_OF_SERVO, SERVOS, CraneVectorEnv
+from crane_env import ACTION_OF_SERVO, SERVOS
 from crane_utils import runs
-from crane_utils.trials import (
-    REPORT_SEED,
-    crane_class,
-    make_envs,
-    monte_carlo_trials,
-    run_trials,
-    task_options,
-)
+from crane_utils import trials as protocol
+from crane_utils.trials import REPORT_SEED
 from hydraulic_crane import PUMP_FLOW, HydraulicCraneVectorEnv, oil_per_movement
 from scripted_crane import ScriptedCrane
 
@@ -107,7 +102,7 @@ def add_row(path: Path, key: dict, policy: Any, trained_on: str, env_id: str) ->
     trials = key["per_diameter"]
     key |= {"trial_seed": REPORT_SEED, "trials": 6 * trials}
     key = {name: str(value) for name, value in key.items()}
-    known, options = read_rows(path), task_options(env_id)
+    known, options = read_rows(path), protocol.task_options(env_id)
     if any(key.items() <= row.items() for row in known):
         return
     if trained_on == "ideal" and hasattr(options, "sensors"):
@@ -123,8 +118,6 @@ def add_row(path: Path, key: dict, policy: Any, trained_on: str, env_id: str) ->
 def levels(trials: int = 100, folder: Path = RESULTS) -> None:
     """Write levels.csv: policies on the other levels, with so many trials per log diameter."""
     for method, trained_on, level in tqdm([*product(METHODS, LEVELS, LEVELS)], unit="row"):
-        if (method, trained_on) == ("scripted", "randomized"):
-            continue  # it is the hydraulic one
         if level == "ideal" and trained_on != "ideal":
             continue  # too few sensors
         policy, seed = policy_of(method, trained_on)
@@ -147,35 +140,35 @@ def changes(trials: int = 25, folder: Path = RESULTS) -> None:
             add_row(folder / "robustness.csv", key, policy, "hydraulic", env_id)
 
 
-class ThenStill:
-    """A policy for 9 s, and then no command. safe: whose log was up and held after those 9 s."""
+def then_still(policy: Any) -> SimpleNamespace:
+    """A policy for 9 s, and then no command."""
 
-    def __init__(self, policy: Any, cranes: CraneVectorEnv):
-        self.policy, self.cranes = policy, cranes
-
-    def predict(self, obs: np.ndarray, state: tuple | None, deterministic: bool = True) -> tuple:
+    def predict(obs: np.ndarray, state: tuple | None, deterministic: bool = True) -> tuple:
         step, memory = state or (0, None)
-        actions, memory = self.policy.predict(obs, memory, deterministic=deterministic)
-        if step == 90:
-            held = [s >= self.cranes.hold_steps for s in self.cranes.streaks.values()]
-            self.safe = np.all(held, axis=0) & (self.cranes.steps == step)
+        actions, memory = policy.predict(obs, memory, deterministic=deterministic)
         return actions * (step < 90), (step + 1, memory)
+
+    return SimpleNamespace(predict=predict)
 
 
 def held(trials: int = 100, folder: Path = RESULTS) -> None:
     """Write held.csv: success after 9 s, and after ten more seconds without command."""
-    for method, level in tqdm([*product(METHODS, LEVELS)], unit="row"):
-        cranes = crane_class(LEVELS[level])
-        env_id, kwargs = f"Held-{level}-v0", gymnasium.spec(LEVELS[level]).kwargs
-        longer = type("Longer", (cranes,), {"TIME_LIMIT": 19.0})
-        gymnasium.register(env_id, vector_entry_point=longer, kwargs=kwargs)
-        diameters, seeds = monte_carlo_trials(REPORT_SEED, trials)
-        envs = make_envs(env_id, len(seeds), diameter=diameters)
-        policy = ThenStill(policy_of(method, level)[0], envs.unwrapped)
-        end = run_trials(policy, envs, seeds)["success"] & policy.safe
-        key = {"method": method, "level": level, "trial_seed": REPORT_SEED, "trials": len(seeds)}
-        key |= {"success": f"{100 * policy.safe.mean():.4g}", "held": f"{100 * end.mean():.4g}"}
-        write_rows(folder / "held.csv", [*read_rows(folder / "held.csv"), key])
+    diameters, seeds = protocol.monte_carlo_trials(REPORT_SEED, trials)
+    for task in LEVELS.values():
+        longer = type("Longer", (protocol.crane_class(task),), {"TIME_LIMIT": 19.0})
+        kwargs = gymnasium.spec(task).kwargs
+        gymnasium.register(f"Held{task}", vector_entry_point=longer, kwargs=kwargs)
+    for method, (level, task) in tqdm([*product(METHODS, LEVELS.items())], unit="row"):
+        known, (policy, _), good = read_rows(folder / "held.csv"), policy_of(method, level), True
+        key = dict(method=method, level=level, trial_seed=str(REPORT_SEED), trials=str(len(seeds)))
+        if any(key.items() <= row.items() for row in known):
+            continue
+        still = then_still(policy)
+        for name, acting, env_id in ("success", policy, task), ("held", still, f"Held{task}"):
+            envs = protocol.make_envs(env_id, len(seeds), diameter=diameters)
+            good &= protocol.run_trials(acting, envs, seeds)["success"]
+            key[name] = f"{100 * good.mean():.4g}"
+        write_rows(folder / "held.csv", [*known, key])
 
 
 if __name__ == "__main__":

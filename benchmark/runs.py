@@ -150,27 +150,22 @@ def write_rows(path: Path, rows: list[dict]) -> None:
     os.replace(unfinished, path)
 
 
-def export(folder: Path) -> list[dict[str, float]]:
+def export(folder: Path) -> list[dict[str, str]]:
     """The rows of a run's folder: COLUMNS after each update."""
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
-    rows: dict[int, dict[str, float]] = {}
+    rows: dict[int, dict[str, str]] = {}
     for tag in COLUMNS.keys() & set(events.Tags()["scalars"]):
         for event in events.Scalars(tag):
             row = rows.setdefault(event.step, dict.fromkeys(["steps", *COLUMNS.values()], ""))
-            row |= {"steps": event.step, COLUMNS[tag]: round(event.value, 5)}
+            row |= {"steps": str(event.step), COLUMNS[tag]: f"{event.value:.7g}"}
     if not rows:
         raise SystemExit(f"{folder} holds no TensorBoard scalars of a run")
     return [rows[step] for step in sorted(rows)]
 
 
-def number(cell: float | str) -> float:
-    return np.nan if cell == "" else float(cell)
-
-
 def curve(rows: list[dict]) -> Curve:
     """A run's rows with an evaluation, and the minutes of rollouts and updates until then."""
-    cells = {name: [row[name] for row in rows] for name in rows[0]}
-    run = {name: np.array([*map(number, column)]) for name, column in cells.items()}
+    run = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
     seconds = np.diff(run["steps"], prepend=0) / run["SPS"]
     seconds[seconds > 10 * np.median(seconds)] = np.median(seconds)  # it was suspended
     run["minutes"] = np.cumsum(seconds) / 60

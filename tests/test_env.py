@@ -232,6 +232,7 @@ def test_rules():
     for joint in (1, 3):
         situation("overspeed", state.dq, joint, 2.01 * SLOWEST[joint])
         situation("overspeed", state.dq, joint, 2.01 * FASTEST[joint])
+        situation("none", state.dq, joint, 1.99 * SLOWEST[joint])
         situation("none", state.dq, joint, 1.99 * FASTEST[joint])
     situation("none", state.grapple_centre, 2, 8.1)
     situation("log_too_far", state.grapple_centre, 2, 8.3)
@@ -253,19 +254,25 @@ def test_success_needs_all_of_the_last_half_second(frame_skip, window, length):
     slips = np.array([0, length - window - 1, length - window, length - 3, length - 1, -1])
 
     class Slipping(CraneVectorEnv):
+        def reached(self, info):
+            return info["time"] > 6.01  # too late to count
+
+        def rules(self, state, info):
+            return {}
+
         def conditions(self, state, info):
             return {"not_first": self.steps > 0, "slipped": self.steps - 1 != slips}
 
     envs = Slipping(6, frame_skip=frame_skip)
     envs.reset(seed=0)
     for k in range(length):
-        envs.reach_time[:] = 1.0  # stand still but claim to have reached the log
         envs.ground_peak[0], envs.ground_peak[1] = 20.1e3, 19.9e3
         *_, terminated, truncated, info = envs.step(np.zeros((6, 6)))
         assert (truncated == (k + 1 == length)).all() and not terminated.any()
         assert info["safe"][5] == (k + 1 >= window)
     kept = slips < length - window
     np.testing.assert_array_equal(info["success"], kept)
+    assert np.isinf(info["time_to_reach"]).all()
     assert info["gentle"].tolist() == [False, True, False, False, False, True]
     assert info["failure"].tolist() == [["slipped", ""][int(ok)] for ok in kept]
     assert [list(outcomes) for outcomes in envs.recent_success] == [[ok] for ok in kept]

@@ -94,7 +94,7 @@ def test_seeds_of_trials():
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_only_the_first_episode_counts(deterministic):
     """The thin log's trial ends after 2 steps; its crane begins two more episodes."""
-    diameter = np.array([0.3, 0.7])
+    diameter = np.array([0.3, 0.6])
     _, seeds = trials.monte_carlo_trials(1, 1, diameter)
     envs = trials.make_envs(QUICK, 2, 1, diameter=diameter)
     metrics = Metrics(envs.unwrapped)
@@ -128,7 +128,7 @@ def test_evaluate_judges_the_full_task():
     results = trials.run_trials(Sway(), envs, seeds)
     assert scores.pop("episodic_return") == pytest.approx(results["episodic_return"].mean())
     rates = {f"success_rate_{d}m": float(d > 0.55) for d in trials.DIAMETERS}
-    assert scores == {"success_rate": 0.5, "gentle_rate": pytest.approx(1 / 3), **rates}
+    assert scores == {"success_rate": 0.5, "gentle_rate": pytest.approx(1 / 6), **rates}
 
 
 def test_evaluate_other_tasks(monkeypatch, capsys):
@@ -170,7 +170,7 @@ def cells(printed):
 
 
 def test_table_csv_and_json(judge, tmp_path):
-    line = f"scripted --env-id {QUICK} --trials 4 --diameters 0.3 0.5 0.7 0.8 --threads 1"
+    line = f"scripted --env-id {QUICK} --trials 4 --diameters 0.3 0.5 0.6 0.8 --threads 1"
     printed = judge(line, f"--csv {tmp_path}/trials.csv").out
     with open(tmp_path / "trials.csv", encoding="utf-8") as file:
         rows = [*csv.DictReader(file)]
@@ -179,10 +179,10 @@ def test_table_csv_and_json(judge, tmp_path):
     assert [row["failure"] for row in rows] == ["thinnest"] * 4 + ["thin"] * 4 + [""] * 8
     assert [row["gentle"] for row in rows] == ["False"] * 8 + ["True"] * 4 + ["False"] * 4
     wins = [row for row in rows if row["success"] == "True"]
-    assert [row["diameter"] for row in wins] == ["0.7"] * 4 + ["0.8"] * 4
+    assert [row["diameter"] for row in wins] == ["0.6"] * 4 + ["0.8"] * 4
     (table,) = cells(printed)
     assert f"on {QUICK}, seed 10000" in printed
-    assert [*table] == ["0.3 m", "0.5 m", "0.7 m", "0.8 m", "all"]
+    assert [*table] == ["0.3 m", "0.5 m", "0.6 m", "0.8 m", "all"]
     assert table["0.3 m"]["failures"] == "thinnest 4" and table["0.3 m"]["success %"] == "0"
     assert table["0.8 m"]["failures"] == "" and table["0.8 m"]["trials"] == "4"
     low, high = wilson_interval(8, 16)

@@ -195,18 +195,10 @@ def test_a_held_log_does_not_sag():
 
 
 def test_capsules_and_signed_distance_fields_touch_alike():
-    """Contact starts within 2 cm of closing, measured at the tips; thick logs are touched sooner.
-
-    Both have one friction, and jaws of 10 capsules each, or of 6 and 3 pieces of mesh.
-    """
-    touched, frictions = {}, set()
-    for contact, log_geom in (("primitive", "log_capsule"), ("sdf", "log")):
+    """Contact starts within 2 cm of closing, at the tips; thick logs are touched sooner."""
+    touched = {}
+    for contact in ("primitive", "sdf"):
         model = CraneVectorEnv(1, contact=contact).model
-        for jaw, pieces in (("jaw_outer", 6), ("jaw_inner", 3)):
-            parts = model.geom_conaffinity & model.geom(log_geom).contype > 0
-            parts &= model.geom_bodyid == model.body(jaw).id
-            assert parts.sum() == (pieces if contact == "sdf" else 10)
-            frictions |= {*map(tuple, model.geom_friction[parts])}
         for diameter in (0.3, 0.55, 0.8):
             log, capsule = model.geom("log"), model.geom("log_capsule")
             log.size[0] = capsule.size[0] = diameter / 2
@@ -227,7 +219,7 @@ def test_capsules_and_signed_distance_fields_touch_alike():
     for diameter in (0.3, 0.55, 0.8):
         angle = touched["primitive", diameter] - touched["sdf", diameter]
         assert abs(angle) * 0.8566 < 0.02
-    assert touched["sdf", 0.8] + 0.2 < touched["sdf", 0.3] and frictions == {(0.5, 0.02, 0.005)}
+    assert touched["sdf", 0.8] + 0.2 < touched["sdf", 0.3]
 
 
 @pytest.mark.parametrize("where, bit, deepest", [("ground", 1, 0.05), ("truck", 2, 0.08)])

@@ -76,7 +76,7 @@ class Odd(gymnasium.Env):
 class Quick(CraneVectorEnv):
     """Trials of half a second. They succeed with logs above 0.55 m, and the others fail as `thin`.
 
-    Those with logs below 0.35 m end after 2 steps. Those with logs above 0.75 m are not gentle.
+    Those with logs below 0.35 m end after 2 steps. Those with logs above 0.65 m are not gentle.
     """
 
     TIME_LIMIT, HOLD_TIME, REVISION = 0.5, 0.1, 3
@@ -85,7 +85,7 @@ class Quick(CraneVectorEnv):
         return {"thinnest": (state.diameter < 0.35) & (self.steps == 2)}
 
     def measure(self, state):
-        self.ground_peak[state.diameter > 0.75] = 30e3
+        self.ground_peak[state.diameter > 0.65] = 30e3
         return super().measure(state)
 
     def conditions(self, state, info):
