@@ -242,6 +242,7 @@ def best_sb3(algorithm: str, ways: list, frame_skip: int, rollout: int) -> list[
 def cells(quick: bool) -> dict[tuple[str, int], Callable[[], list[float]]]:
     """What to measure, by name and frame skip."""
     policy, script = runs.load_policy(Path(SHIPPED))[0], ScriptedCrane()
+    os.environ.pop("GOMP_SPINCOUNT", None)  # the script has set it; SB3 has torch's default
     tenths, rollout = (3, 8 * CRANES) if quick else (90, 128 * CRANES)
     found: dict = {("the paper's PPO", 1): lambda: [6500.0]}
     for skip in (20, 1):

@@ -135,12 +135,9 @@ def monte_carlo_trials(
 
 
 def run_trials(
-    policy: Any,
-    envs: gymnasium.vector.VectorEnv,
-    seeds: Any,
-    deterministic: bool = True,
-    metrics: Any = None,
-) -> dict[str, Array]:
+    policy: Any, envs: gymnasium.vector.VectorEnv, seeds: Any,
+    deterministic: bool = True, metrics: Any = None,
+) -> dict[str, Array]:  # fmt: skip
     """One whole episode in each environment of `make_envs`: results at its end, (N,) each.
 
     policy.predict(obs (N, obs_dim), state, deterministic=...) returns actions (N, act_dim) and the

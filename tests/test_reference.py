@@ -2,7 +2,8 @@
 
 Three cranes do three things. The first drives as the scripted crane and lifts its log. The second
 strikes the ground, waits, and lunges just before it is too late to reach the log. The third turns
-its rotator into the end stop. All that `step` returns is compared, with metrics and engine's state.
+its rotator into the end stop, and begins anew at full speed. All that `step` returns is compared,
+and the metrics, and the engine's state.
 """
 
 from collections import Counter
@@ -46,6 +47,8 @@ class Drivers:
             return [0.9, -0.5, 0.8, 1.5, -0.7, 1.0] if late else [0.0] * 6
         if i == 2 and self.episodes[i] == 1:
             return [-1.5, 0.1, 0.0, 0.0, np.copysign(1.5, crane.drawn_start[0][6]), 0.2]
+        if i == 2 and self.episodes[i] == 2 and time < 0.5:
+            return [1.0] * 6
         obs = np.array([crane.observe(**PLAIN)[:18]])
         actions, self.memory[i] = self.scripted.predict(obs, self.memory[i])
         return actions[0].tolist()
@@ -139,7 +142,7 @@ RUNS = {  # task, seconds, options, attributes of a subclass, what must be seen
     "ideal": (IDEAL_ID, 18, {}, {}, LIFTED | HIT),
     "hydraulic": (HYDRAULIC_ID, 18, {}, {}, LIFTED | HIT),
     "randomized": (RANDOMIZED_ID, 18, {"pose_noise": "episode"}, {}, LIFTED | HIT),
-    "half randomized": (RANDOMIZED_ID, 12, {"randomize": 0.5, "frame_skip": 7}, {}, LIFTED | HIT),
+    "half randomized": (RANDOMIZED_ID, 12, {"randomize": 0.5, "frame_skip": 7}, {}, HIT),
     "sizes": (IDEAL_ID, 11, {"diameter": [0.35, 0.5, 0.75], "pose_noise": "step"}, {}, LIFTED),
     "printed": (IDEAL_ID, 10, {"reward": "paper", "offset": "minus", "axes": "world"}, {}, LIFTED),
     "eased": (IDEAL_ID, 11, {"difficulty": 0.4, "frame_skip": 3}, {}, LIFTED | HIT),
