@@ -2,7 +2,8 @@
 
     torchrun ... ranks_program.py FOLDER WHEN ARGUMENTS
 
-Each rank leaves FOLDER/rank<r>.pt. The last rank gets a signal at its WHEN-th step, 0 for none.
+Each rank leaves FOLDER/rank<r>.pt. The last rank gets a signal at its WHEN-th step, 0 for none. Its
+processor seems to round otherwise: without the others' its first weights would be larger.
 """
 
 import os
@@ -25,13 +26,15 @@ def counted_step(self, action):
     return step(self, action)
 
 
-Toy.step = counted_step
+Toy.step, orthogonal = counted_step, torch.nn.init.orthogonal_
+torch.nn.init.orthogonal_ = lambda w, gain: orthogonal(w, 1.01 * gain if last else gain)
 run = Recording(folder)
 try:
     left = run.run("mppo_beta_torchrun", *sys.argv[3:])
 finally:
     kept = {name: getattr(run, name) for name in ("starts", "steps", "permutations", "samples")}
     kept |= {"first": run.first, "updates": run.updates, "scalars": run.scalars}
+    kept |= {"purge_steps": run.purge_steps}
     if "left" in vars():
         kept |= {"last": left["agent"].state_dict()}
     torch.save(kept, folder / f"rank{os.environ['RANK']}.pt")

@@ -281,6 +281,10 @@ def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained):
     assert "on ForestryCrane-v0, seed" in asked.out
     assert "the policy was made for axes 'world', not 'crane'" in asked.err
     assert "the policy was made for revision 3, not 7" in asked.err
+    tables = [
+        json.loads(judge(line, f"--json {flag}").out)["table"] for flag in ("", "--env.axes crane")
+    ]
+    assert tables[0] != tables[1]
 
 
 def test_a_run_is_built_by_the_script_that_made_it(trained, tmp_path):

@@ -53,6 +53,7 @@ def test_two_ranks_are_one_algorithm(tmp_path):
     saved = torch.load(folder / "checkpoint.pt", weights_only=True)
     assert saved["iteration"] == 4
     assert same(saved["weights"], again[0]["last"]) and same(saved["weights"], again[1]["last"])
+    assert again[0]["purge_steps"] == [3 * N * STEPS + 1]
     assert again[0]["scalars"]["eval/episodic_return"].keys() == {4 * N * STEPS}
     # no start and no sample twice; the ranks' policies are almost equal at first
     assert (ranks[0]["samples"][0] - ranks[1]["samples"][0]).abs().mean() > 0.03

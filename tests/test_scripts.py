@@ -370,9 +370,10 @@ def test_python_without_docstrings_has_help(monkeypatch):
 @pytest.mark.parametrize("task", ["NanReward-v0", "InfObs-v0", "InfStart-v0"])
 def test_what_is_not_finite_is_named(tmp_path, task):
     line = f"{SMALL} --env-id toy_tasks:{task} --minibatch-size 16 --total-timesteps {UPDATE}"
-    name = "reward" if "Reward" in task else "observation"
+    run, name = Recording(tmp_path), "reward" if "Reward" in task else "observation"
     with pytest.raises(SystemExit, match=f"the {name} of environment 0 is not finite: .*(nan|inf)"):
-        Recording(tmp_path).run("ppo_crane", line)
+        run.run("ppo_crane", line)
+    assert len(run.steps) == (0 if "Start" in task else 2)  # at once
     assert not list(tmp_path.glob("runs/*/policy.pt"))
 
 

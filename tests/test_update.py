@@ -38,6 +38,7 @@ def test_updates(tmp_path, script):
     settings |= {"hidden_sizes": (5, 4), "iterations": ITERATIONS}
     reference = Reference(settings, run.first[0])
     obs, permutations = run.starts[0], run.permutations
+    check_start(run.first[0], "log_std" not in run.first[0])
     kinds, epochs_done, all_stats = set(), [], []
     for k, update in enumerate(run.updates):
         records = run.steps[k * steps : (k + 1) * steps]
@@ -99,6 +100,16 @@ def batches(permutations, settings):
     return epochs
 
 
+def check_start(weights, of_beta):
+    """The first weights: orthogonal ones, and a policy as wide as asked."""
+    for layer, scale in [("actor.0", 2), ("critic.2", 2), ("actor.4", 1e-4), ("critic.4", 1)]:
+        weight = weights[f"{layer}.weight"]
+        weight = weight if len(weight) <= len(weight.T) else weight.T
+        close(weight @ weight.T, scale * torch.eye(len(weight)), layer)
+    width = weights["actor.4.bias"] - 0.3 if of_beta else weights["log_std"] + 0.5
+    close(width, torch.zeros_like(width), "width")
+
+
 def check_actions(script, k, settings, actions, records, samples):
     """The actions of an update were drawn from the policy, perhaps perturbed, and executed."""
     drawn = torch.stack(samples[: len(records)])
@@ -117,6 +128,7 @@ def check_actions(script, k, settings, actions, records, samples):
         torch.testing.assert_close(actions, drawn, rtol=0, atol=0)
         expected = low + (high - low) * (np.clip(actions.numpy(), -1, 1) + 1) / 2
     np.testing.assert_allclose(executed, expected, atol=1e-6)
+    assert executed.dtype == np.float32  # as the task's
 
 
 def close(ours, theirs, what=""):
