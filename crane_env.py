@@ -326,7 +326,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     TIME_LIMIT = 9.0  # s, of an episode (paper, Tables I and II)
     REACH_TIME = 6.0  # s, by which the log must have been reached (paper)
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
-    GOALS: tuple[str, ...] = ()  # rules that end an episode well, if `conditions` have held
+    GOALS: tuple[str, ...] = ()  # rules that end an episode well, such as {"parked": info["safe"]}
     PIECE = 5  # physics steps between two clamps of the integrators (assets/README.md)
     # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
@@ -439,17 +439,17 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info |= terms
         reward = sum(terms.values())
 
+        # success: each condition held at every step of the last HOLD_TIME
+        holds = self.conditions(state, info)
+        self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
+        held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
+        info["safe"] = np.all([*held.values()], axis=0)
+
         # rules
         rules = self.rules(state, info) | {"time_limit": time > self.TIME_LIMIT - 1e-9}
         ending = np.select([*rules.values()], [*rules], default="none")
         done, truncated = ending != "none", ending == "time_limit"
         terminated = done & ~truncated
-
-        # success: each condition held at every step of the last HOLD_TIME, no rule ended it early
-        holds = self.conditions(state, info)
-        self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
-        held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
-        info["safe"] = np.all([*held.values()], axis=0)
         success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
         gentle = success & (self.ground_peak <= GENTLE_FORCE)
         failure = np.select([~ok for ok in held.values()], [*held], default="")

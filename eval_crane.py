@@ -117,10 +117,11 @@ def load_policy(name: str) -> tuple[Any, dict[str, Any], str]:
     """A policy, the task it was trained on or written for, and a name for the tables."""
     if name in BUILT_IN or (":" in name and not Path(name).exists()):
         module, _, attribute = BUILT_IN.get(name, name).partition(":")
-        policy = getattr(importlib.import_module(module), attribute)()
+        made = getattr(importlib.import_module(module), attribute, None)
+        if not hasattr(made, "predict"):
+            raise SystemExit(f"{name} must be a class with predict (docs/compare.md)")
+        policy = made()
         return policy, getattr(policy, "task", {}), name
-    if not Path(name).exists():
-        raise SystemExit(f"no {name}: give a run's folder, a policy.pt or my_module:MyPolicy")
     return runs.load_policy(Path(name))
 
 

@@ -178,6 +178,8 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
     the script of that name in this repository.
     """
     path = path / "policy.pt" if path.is_dir() else path
+    if not path.is_file():
+        raise SystemExit(f"no {path}: give a run's folder, or a policy.pt")
     saved = load(path)
     script = path.parent / saved["script"]
     if not script.is_file():

@@ -32,9 +32,8 @@ run = Recording(folder)
 try:
     left = run.run("mppo_beta_torchrun", *sys.argv[3:])
 finally:
-    kept = {name: getattr(run, name) for name in ("starts", "steps", "permutations", "samples")}
-    kept |= {"first": run.first, "updates": run.updates, "scalars": run.scalars}
-    kept |= {"purge_steps": run.purge_steps}
+    names = "starts steps permutations samples first updates scalars purge_steps".split()
+    kept = {name: getattr(run, name) for name in names}
     if "left" in vars():
         kept |= {"last": left["agent"].state_dict()}
     torch.save(kept, folder / f"rank{os.environ['RANK']}.pt")

@@ -12,7 +12,7 @@ SETTINGS = {  # of the compared runs
     "reward_scale": 0.5, "target_kl": 0.0085, "max_grad_norm": 1.5, "narrowing": 0.3,
     "horizon_growth": 2.0, "curriculum": 0.5,
 }  # fmt: skip
-CLIPPED = {"clip_coef": 0.1, "ent_coef": 0.05, "vf_coef": 0.7, "minibatch_size": 16}
+CLIPPED = {"clip_coef": 0.1, "ent_coef": 0.05, "vf_coef": 0.7}
 
 
 def flags(settings: dict) -> str:
@@ -267,7 +267,9 @@ class Reference:
             return fisher + args["cg_damping"] * torch.eye(len(start))
 
         start = torch.cat([self.w[k].detach().reshape(-1) for k in names])
-        before, gradient = (x.detach() for x in self.gradient_of(surrogate, start))
+        at = start.clone().requires_grad_()
+        before = surrogate(at)
+        (gradient,) = torch.autograd.grad(before, at)
         direction = torch.linalg.solve(damped_fisher(sample), gradient)
         curvature = direction @ damped_fisher(everything) @ direction
         full_step = torch.sqrt(2 * args["target_kl"] / curvature) * direction
@@ -290,9 +292,3 @@ class Reference:
             stats.setdefault("losses/grad_norm", []).append(norm)
         self.w["log_std"] = self.w["log_std"] - args["narrowing"] / args["iterations"]
         return stats
-
-    @staticmethod
-    def gradient_of(function, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        at = at.clone().requires_grad_()
-        value = function(at)
-        return value, torch.autograd.grad(value, at)[0]

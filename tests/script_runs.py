@@ -84,8 +84,6 @@ class Recording:
         """Run a script with these words as arguments; the variables that it left."""
         words = [word for argument in arguments for word in str(argument).split()]
         path, self.seen = str(ROOT / f"{script}.py"), None
-        keep_sample = lambda args, result: self.samples.append(result)  # noqa: E731
-        keep_permutation = lambda args, result: self.permutations.append(result.tolist())  # noqa: E731
         with contextlib.ExitStack() as stack:
             for patch in [
                 mock.patch.object(sys, "argv", [path, *words]),
@@ -93,9 +91,9 @@ class Recording:
                 mock.patch.object(torch.utils.tensorboard, "SummaryWriter", self.begin),
                 self.watch(RecordEpisodeStatistics, "reset", self.keep_start),
                 self.watch(RecordEpisodeStatistics, "step", self.keep_step),
-                self.watch(torch, "randperm", keep_permutation),
-                self.watch(Beta, "sample", keep_sample),
-                self.watch(Normal, "sample", keep_sample),
+                self.watch(torch, "randperm", lambda _, x: self.permutations.append(x.tolist())),
+                self.watch(Beta, "sample", lambda _, x: self.samples.append(x)),
+                self.watch(Normal, "sample", lambda _, x: self.samples.append(x)),
                 contextlib.chdir(self.folder),
             ]:
                 stack.enter_context(patch)

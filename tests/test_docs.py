@@ -4,7 +4,6 @@ import importlib
 import re
 import runpy
 import shlex
-import shutil
 import sys
 
 import numpy as np
@@ -118,7 +117,6 @@ def test_code_runs(page, tmp_path, monkeypatch, capsys):
             monkeypatch.setattr(sys, "argv", ["eval_crane.py", *words.split()])
             eval_crane.main()
             assert f"{module}:{policy}" in capsys.readouterr().out
-    shutil.rmtree(tmp_path / "runs", ignore_errors=True)
 
 
 def check_recipe(policy):

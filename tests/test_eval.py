@@ -20,7 +20,6 @@ import eval_crane
 from crane_utils import export_onnx, film, runs, trials
 from crane_utils.metrics import Metrics
 from eval_crane import SHIPPED, wilson_interval
-from scripted_crane import ScriptedCrane
 
 QUICK = "toy_tasks:Quick-v0"  # toy_tasks.Quick says how its trials end
 POLICIES = ROOT / "assets" / "policies"
@@ -85,9 +84,8 @@ def test_seeds_of_trials():
     """As docs/compare.md defines them: published scores belong to them."""
     diameters, seeds = trials.monte_carlo_trials(7, 2, [0.3, 0.85])
     assert diameters.tolist() == [0.3, 0.3, 0.85, 0.85]
-    states = [seed.generate_state(2).tolist() for seed in seeds]
-    keys = [(300, 0), (300, 1), (850, 0), (850, 1)]
-    assert states == [SeedSequence(7, spawn_key=k).generate_state(2).tolist() for k in keys]
+    for seed, key in zip(seeds, [(300, 0), (300, 1), (850, 0), (850, 1)], strict=True):
+        assert (seed.generate_state(9) == SeedSequence(7, spawn_key=key).generate_state(9)).all()
     assert (trials.EVAL_SEED, trials.REPORT_SEED) == (10_000, 60_000)
 
 
@@ -270,7 +268,7 @@ def test_a_film_is_of_the_trial_that_was_asked_for(judge, monkeypatch, trained):
 
 
 def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained):
-    line = f"{trained} --trials 1 --diameters 0.5"
+    line = f"{trained} --trials 1 --diameters 0.6"
     asked = judge(line)
     assert f"on {QUICK}, axes=world, seed" in asked.out and not asked.err.count("made for")
     asked = judge(line, "--env.axes crane --env.frame-skip 10")
@@ -281,9 +279,8 @@ def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained):
     assert "on ForestryCrane-v0, seed" in asked.out
     assert "the policy was made for axes 'world', not 'crane'" in asked.err
     assert "the policy was made for revision 3, not 7" in asked.err
-    tables = [
-        json.loads(judge(line, f"--json {flag}").out)["table"] for flag in ("", "--env.axes crane")
-    ]
+    flags = ("--json", "--json --env.axes crane")
+    tables = [json.loads(judge(line, flag).out)["table"] for flag in flags]
     assert tables[0] != tables[1]
 
 
@@ -353,8 +350,6 @@ def test_a_policy_of_the_users_own(judge, tmp_path, monkeypatch):
 
 def test_built_in_policies():
     obs = np.zeros((40, 18))
-    for name, expected in [("zero", eval_crane.Zero), ("scripted", ScriptedCrane)]:
-        assert type(eval_crane.load_policy(name)[0]).__name__ == expected.__name__
     assert not eval_crane.Zero().predict(obs, None)[0].any()
     actions, _ = eval_crane.Random().predict(obs, None)
     assert actions.shape == (40, 6) and actions.min() < -0.9 and actions.max() > 0.9

@@ -24,7 +24,7 @@ def torchrun(folder, when, *arguments):
         "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")]),
         "OMP_NUM_THREADS": "1",
     }
-    how = {"capture_output": True, "text": True, "timeout": 100, "env": os.environ | paths}
+    how = {"capture_output": True, "text": True, "timeout": 300, "env": os.environ | paths}
     ran = subprocess.run([*line, *words], **how)
     ranks = [torch.load(folder / f"rank{r}.pt", weights_only=False) for r in (0, 1)]
     return ran, ranks

@@ -10,15 +10,16 @@ from reference_update import CLIPPED, SETTINGS, Reference, flags
 from script_runs import ALGORITHMS, Recording
 
 OWN = {
-    "mppo_beta_crane": CLIPPED | {"log_excess_init": 0.3, "perturbation": 0.2, "perturbed": 0.5},
-    "ppo_crane": CLIPPED | {"log_std_init": -0.5},
+    "mppo_beta_crane": CLIPPED | {
+        "minibatch_size": 16, "log_excess_init": 0.3, "perturbation": 0.2, "perturbed": 0.5,
+    },
+    "ppo_crane": CLIPPED | {"minibatch_size": 16, "log_std_init": -0.5},
     "trpo_crane": {
         "minibatch_size": 16, "target_kl": 0.02, "cg_iters": 200, "cg_damping": 0.05,
         "fisher_samples": 20, "backtrack_iters": 5, "backtrack_coeff": 0.7, "log_std_init": -0.5,
     },
     "recurrent_ppo_crane": CLIPPED | {"lstm_size": 3, "num_minibatches": 2, "log_std_init": -0.5},
 }  # fmt: skip
-del OWN["recurrent_ppo_crane"]["minibatch_size"]
 ITERATIONS = 3
 
 
