@@ -164,7 +164,7 @@ def response(axis: str, action: float, at_work: bool = False) -> Array:
     q = np.array([[-1.2, q2, q3, q4, np.pi / 2 - q2 - q3, np.pi / 2, 0, q8]])
     far_log = np.array([[-20.0, 0.0, 0.0]])  # out of the way
     start, i = (np.zeros(1, int), q, far_log, np.array([0.3])), [*AXES].index(axis)
-    crane = HydraulicCraneVectorEnv(1, env_threads=1, frame_skip=1)
+    crane = HydraulicCraneVectorEnv(1, env_threads=1, frame_skip=1, autoreset=False)
     crane.reset(seed=0)
     crane.place(*start)
     if not at_work:
