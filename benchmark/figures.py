@@ -198,7 +198,7 @@ def drives() -> None:
         panel.plot(seconds, both_ways[0], label="this model")
         panel.plot(seconds, response(axis, 0.4, True), "C0:", label="at work, its own inertia")
         panel.plot(at, measured, "ko", markersize=4, label="machine")
-        panel.set_title(f"{axis}: {worst.max():.2f} apart at most")
+        panel.set_title(f"{axis}\n{worst.max():.2f} apart at most", fontsize=10)
         panel.set_xlabel("time since the command [s]")
         panel.set_xlim(0, at[-1] + 0.05)
     panels[0].set_ylabel("speed / commanded speed")
