@@ -191,10 +191,10 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
     sys.modules[spec.name] = module  # where dataclasses look for it
     spec.loader.exec_module(module)
     weights = saved["weights"]
-    if wrong := [name for name, w in weights.items() if w.isnan().any()]:
+    finite = {name: w.isfinite().all() for name, w in weights.items() if name[:7] != "action_"}
+    if wrong := [name for name, good in finite.items() if not good]:
         raise SystemExit(f"{path}: {', '.join(wrong[:3])} not finite")
     bounds = weights["action_low"].numpy(), weights["action_high"].numpy()
     agent = module.Agent(len(weights["obs_mean"]), *bounds, restore_args(module.Args, saved))
-    # policy.pt has no critic, and acting needs none
-    agent.load_state_dict(agent.critic.state_dict(prefix="critic.") | weights)
+    agent.load_state_dict(agent.critic.state_dict(prefix="critic.") | weights)  # it has no critic
     return agent, saved["task"], script.name
