@@ -378,6 +378,7 @@ class ReferenceCrane:
         info, time, held = self.measure(), self.steps * self.dt, all(self.touching())
         if info["d_combine"] < 0.35 and time < self.reach_time + 1e-9:
             self.reached_at = min(self.reached_at, time)
+        self.carried = clip(1 - self.support / (self.mass * G), 0, 1)
         terms = self.staged(info, held) if self.options["reward"] == "staged" else self.paper(info)
         ending = self.ending(time)
         conditions = {"not_lifted": info["clearance"] >= 0.1, "not_held": held}
@@ -413,11 +414,10 @@ class ReferenceCrane:
             grip, closed = grip * clip(0.5 + depth, 0, 1), 1 if held else min(closed, 0.5)
             most, weight = 3, 90
         lift = grip * sqrt(min(clear, 1 / clear))
-        carried = clip(1 - self.support / (self.mass * G), 0, 1) * held
         return {
             "r_distance": exp(-far),
             "r_grapple": 2 * min(1, exp(-3 * (far - 0.35))) * exp(-((miss / 0.5) ** 2)) * closed,
-            "r_lift": 2 * lift + centred * carried,
+            "r_lift": 2 * lift + centred * self.carried * held,
             "r_balance": 3 * (1 - tanh(hypot(*self.command[:5]))) * lift * held,
             "r_ground": -weight * self.difficulty**4 * clip(self.impact / 10e3 - 1, 0, most),
         }

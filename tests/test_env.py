@@ -155,6 +155,7 @@ def test_render(opengl):
     first = envs.render()
     assert first[0].shape == (240, 320, 3) and first[0].dtype == np.uint8 and first[0].std() > 10
     assert np.abs(envs.picture(0, "overview").astype(int) - first[0]).max() > 50
+    assert cranes().model.ngeom < envs.model.ngeom  # what is only drawn is left out
     for _ in range(10):
         envs.step([[0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0]])
     still, moved = (np.abs(a.astype(int) - b).max() for a, b in zip(envs.render(), first))
@@ -246,6 +247,15 @@ def test_rules():
     rules = envs.rules(state, info)
     for i, ending in enumerate(expected):
         assert next((name for name, holds in rules.items() if holds[i]), "none") == ending, i
+
+
+def test_conditions():
+    envs, miss = cranes(4), np.array([0.3, 0.1, 0.1, 0.301])
+    state, info = envs.state(), {"clearance": np.array([0.1, 0.099, 0.2, 0.2]), "centre_miss": miss}
+    state.touching[:] = [[True, True], [True, True], [True, False], [True, True]]
+    conditions = envs.conditions(state, info).items()
+    failed = {name: np.flatnonzero(~ok).tolist() for name, ok in conditions}
+    assert failed == {"not_lifted": [1], "not_held": [2], "off_centre": [3]}
 
 
 @pytest.mark.parametrize("frame_skip, window, length", [(20, 6, 90), (7, 15, 258)])

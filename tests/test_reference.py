@@ -8,6 +8,7 @@ and the metrics, and the engine's state.
 
 from collections import Counter
 from dataclasses import asdict
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -54,7 +55,7 @@ class Drivers:
         return actions[0].tolist()
 
 
-def same(ours, reference, what, tolerance=2e-6):
+def compare(ours, reference, what, tolerance=1e-5):
     ours, reference = np.ravel(ours), np.ravel(reference)
     if reference.dtype.kind in "bU":
         assert ours.tolist() == reference.tolist(), what
@@ -67,11 +68,11 @@ def same_model(envs, i, crane):
     ours, reference = envs.batch.get_model(i), crane.model
     names = "body_mass body_inertia body_invweight0 dof_damping dof_invweight0 actuator_delay"
     for name in [*names.split(), "actuator_gainprm", "actuator_biasprm"]:
-        same(getattr(ours, name), getattr(reference, name), f"crane {i}, {name}")
+        compare(getattr(ours, name), getattr(reference, name), f"crane {i}, {name}")
     for geom in ("log", "log_capsule", "ground"):
         for name in ("size", "friction", "rbound"):
             values = getattr(ours.geom(geom), name), getattr(reference.geom(geom), name)
-            same(*values, f"crane {i}, {name} of {geom}")
+            compare(*values, f"crane {i}, {name} of {geom}")
 
 
 def replay(envs, seconds, drivers=None, difficulties=(), **task):
@@ -82,6 +83,9 @@ def replay(envs, seconds, drivers=None, difficulties=(), **task):
     diameters = envs.fixed_diameter if envs.fixed_diameter is not None else [None] * len(seeds)
     task |= {"difficulty": envs.difficulty, "retry": envs.retry}
     cranes = [ReferenceCrane(s, options, hydraulic, d, **task) for s, d in zip(seeds, diameters)]
+    # The paper's solver stops early, and within a step its errors add up.
+    rough = options["contact"] == "sdf" and options["frame_skip"] > 1
+    same = partial(compare, tolerance=2e-3 if rough else 1e-5)
     # an observer looks after each physics step, and must not change what the crane does
     metrics, seen = Metrics(envs) if envs.frame_skip > 3 else None, Counter()
     obs, info = envs.reset(seed=5)
@@ -95,7 +99,7 @@ def replay(envs, seconds, drivers=None, difficulties=(), **task):
         envs.difficulty = dict(difficulties).get(step, envs.difficulty)
         actions = np.array([drivers.act(i, crane) for i, crane in enumerate(cranes)])
         obs, reward, terminated, truncated, info = envs.step(actions)
-        costs = metrics.after_step(info) if metrics else {}
+        costs, carried = metrics.after_step(info) if metrics else {}, envs.state().carried
         for i, crane in enumerate(cranes):
             here = f"crane {i}, step {step}: "
             crane.difficulty = envs.difficulty
@@ -116,6 +120,7 @@ def replay(envs, seconds, drivers=None, difficulties=(), **task):
                 assert info[f"_{name}"][i] == ended, here + name
             for name, value in costs.items():
                 same(value[i], crane.costs[name], here + name)
+            same(carried[i], 1 if ended else crane.carried, here + "carried")
             seen["hit"] += said.get("r_ground", 0) < 0
             seen["lifted"] += said["clearance"] > 0.3 and all(crane.touching())
             seen["ends"] += ended
@@ -127,7 +132,7 @@ def replay(envs, seconds, drivers=None, difficulties=(), **task):
                 drivers.begin(i)
             state = {name: getattr(envs.batch, name)[i] for name in ("qpos", "qvel", "act")}
             for name, value in state.items():
-                same(value, getattr(crane.data, name), here + name, 1e-7)
+                same(value, getattr(crane.data, name), here + name)
             crane.follow(**state, qacc_warmstart=envs.batch.qacc_warmstart[i])
         seen["out of step"] += len({crane.steps % crane.piece for crane in cranes}) > 1
     envs.close()
