@@ -92,7 +92,7 @@ ACTUATED = [0, 1, 2, 3, 6, 7]  # the six of our q1 ... q8 that an action moves
 LOG_LENGTH = 2.75  # m (paper)
 LOG_DENSITY = 650.0  # kg/m^3, the low end of green spruce; the paper does not give it
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter (paper)
-REACH_DISTANCE = 0.35  # m, epsilon of d_combine; with less, good grips off the centre do not count
+REACH_DISTANCE = 0.35  # m, epsilon of d_combine, not published (docs/learned.md, Reward)
 LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre (paper)
 LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.005 rad or 0.012 m
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
@@ -326,7 +326,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     TIME_LIMIT = 9.0  # s, of an episode (paper, Tables I and II)
     REACH_TIME = 6.0  # s, by which the log must have been reached (paper)
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
-    GOALS: tuple[str, ...] = ()  # rules that end an episode well, such as {"parked": info["safe"]}
+    GOALS: tuple[str, ...] = ()  # names of `rules` that end an episode well where it is `safe`
     PIECE = 5  # physics steps between two clamps of the integrators (assets/README.md)
     # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
@@ -507,7 +507,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if self.options.contact == "sdf":  # the paper's contacts, integrator and solver
             spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
             spec.option.solver = mujoco.mjtSolver.mjSOL_CG
-            # the cheapest search that misses no contact (docs/learned.md)
+            # half of these points miss three times as many touches (assets/README.md)
             spec.option.sdf_initpoints, spec.option.sdf_iterations = 8, 5
             # Collision bits of crane.xml: 4 is the log's. 8 collides with nothing, but a geom
             # without any bit counts as only drawn.

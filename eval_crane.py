@@ -217,7 +217,7 @@ def print_table(lines: dict[str, dict]) -> None:
 def main() -> None:
     sys.path.insert(0, os.getcwd())  # where the user's policies and tasks are
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # `2>&-` closes it
-    summary, _, usage = __doc__.partition("\n\n")
+    summary = (__doc__ or "").partition("\n\n")[0]  # python -OO has no docstrings
     args, flags = tyro.cli(
         Args,
         description=summary + " --env.NAME changes an option of the task, as in the training.",

@@ -47,8 +47,8 @@ OIL = np.array(
     [[12.724e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
      [12.724e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
-FULL_TELESCOPE = 3.849e-3  # m^3/m, and m^2, where the load is too heavy for the rod side to help
-SERVOS_OF_ACTION = np.array([1, 1, 1, 2, 1, 2])  # that share a cylinder's force
+FULL_TELESCOPE = 3.849e-3  # m^3/m of the telescope's way out under a load too heavy for that
+SERVOS_OF_ACTION = np.array([1, 1, 1, 2, 1, 2])  # how many share the force of the oil
 FIRST_SERVO = [0, 1, 2, 3, 5, 6]  # of each command: the first telescope stage, the outer jaw
 PASSIVE = [4, 5]  # of our q1 ... q8
 

@@ -95,9 +95,9 @@ class CheckFinite(gymnasium.vector.VectorWrapper):
         obs, reward, *rest, info = super().step(actions)
         self.check("observation", obs)
         self.check("reward", reward)
-        ends = info.get("final_obs", obs)
-        ends = [row if end is None else end for row, end in zip(obs, ends)]
-        self.check("last observation", np.stack(ends))
+        if "final_obs" in info:
+            ends = [row if end is None else end for row, end in zip(obs, info["final_obs"])]
+            self.check("last observation", np.stack(ends))
         return obs, reward, *rest, info
 
 
