@@ -261,14 +261,9 @@ def paper_terms(state: CraneState, d_combine: Array, command: Array) -> dict[str
 
 
 def staged_terms(
-    state: CraneState,
-    distance: Array,
-    clearance: Array,
-    miss: Array,
-    command: Array,
-    closed: Array,
-    grip: Array,
-) -> dict[str, Array]:
+    state: CraneState, distance: Array, clearance: Array, miss: Array, command: Array,
+    closed: Array, grip: Array,
+) -> dict[str, Array]:  # fmt: skip
     """r_grapple pays for jaws that close near the log's centre, r_lift for a log that rises there,
     r_balance for a crane that holds still while both jaws hold the lifted log, (N,) each.
 
@@ -327,7 +322,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     REACH_TIME = 6.0  # s, by which the log must have been reached (paper)
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
     GOALS: tuple[str, ...] = ()  # names of `rules` that end an episode well where it is `safe`
-    PIECE = 5  # physics steps between two clamps of the integrators (assets/README.md)
+    COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_DISCRETE  # of a larger physics_step
+    PIECE = 0.025  # s between two clamps of the integrators (assets/README.md)
     # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
     GROUND_WEIGHT, GROUND_MOST = 30.0, 1.0
@@ -338,6 +334,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
         difficulty: float = 1.0,
         retry: float = 0.0,
+        physics_step: float = 0.0,  # s, at most; never below that of crane.xml, 0.005
         env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: Literal["human", "rgb_array"] | None = None,
         camera: Literal["overview", "side", "grapple"] = "overview",
@@ -361,12 +358,17 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if decorate:
             decorate(spec)
         spec.compiler.discardvisual = render_mode is None  # the same motion, sooner
+        self.dt = self.options.frame_skip * spec.option.timestep  # s, one step
+        self.frame_skip = self.options.frame_skip  # physics steps in a step
+        if spec.option.timestep < physics_step <= self.dt:
+            self.frame_skip = int(np.ceil(self.dt / physics_step - 1e-9))
+            spec.option.timestep = self.dt / self.frame_skip
+            spec.option.integrator = self.COARSE_INTEGRATOR
+        self.piece = int(np.ceil(self.PIECE / spec.option.timestep - 1e-9))  # and in a piece
+        spec.sensor("ground_force").nsample = self.piece
         self.model = model = spec.compile()
-        self.frame_skip = self.options.frame_skip
-        self.dt = self.frame_skip * model.opt.timestep  # s, one step
         self.max_steps = int(np.ceil(self.TIME_LIMIT / self.dt - 1e-9))
-        # The hold begins and ends with a step, and both count.
-        self.hold_steps = int(np.floor(self.HOLD_TIME / self.dt + 1e-9)) + 1
+        self.hold_steps = int(np.floor(self.HOLD_TIME / self.dt + 1e-9)) + 1  # both ends count
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
         self.batch = batch = Batch(model, num_envs, env_threads, persistent=True)
@@ -377,7 +379,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.act, self.qfrc_bias = batch.bind("act")[:, :8], batch.bind("qfrc_bias")
         self.sensordata = batch.bind("sensordata")
         # history ends with ground_force, the only sensor that has one: x, y, z of the last steps
-        self.ground_force = batch.bind("history")[:, -3 * self.PIECE :]
+        self.ground_force = batch.bind("history")[:, -3 * self.piece :]
         self.joint_range = model.jnt_range[JOINTS]  # (8, 2), rad and m
         self.servo_kp = np.tile(model.actuator_gainprm[INTEGRATORS, 0], (num_envs, 1))
         # N m and N, lowest and highest that each servo may push with, (2, N, 8)
@@ -464,8 +466,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         # autoreset
         of_ends = ("success", "is_success", "gentle", "failure")
-        everywhere = np.ones(self.num_envs, bool)
-        info |= {f"_{key}": done if key in of_ends else everywhere for key in info}
+        info |= {f"_{key}": done | (key not in of_ends) for key in info}
         if self.autoreset and done.any():
             info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
@@ -503,7 +504,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """The model: assets/crane.xml with the contacts that the options ask for."""
         spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
         spec.geom("log").size[1] = LOG_LENGTH / 2
-        spec.sensor("ground_force").nsample = self.PIECE
         if self.options.contact == "sdf":  # the paper's contacts, integrator and solver
             spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
             spec.option.solver = mujoco.mjtSolver.mjSOL_CG
@@ -587,11 +587,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
         # lead keeps squeezing the log at zero command, as a check valve does. If a step is shorter
         # than a piece, only every k-th step of an episode begins a piece.
-        every = max(1, self.PIECE // self.frame_skip)
+        every = max(1, self.piece // self.frame_skip)
         due = self.steps % every == 0
         left = self.frame_skip  # physics steps to go
         while left:
-            nstep = min(self.PIECE, left)
+            nstep = min(self.piece, left)
             self.drive(np.flatnonzero(due), nstep * every * self.model.opt.timestep)
             low, high = self.qpos[:, SERVOS] + self.force_limit / self.servo_kp
             np.clip(self.act, low, high, out=self.act, where=due[:, None])

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 import tyro
 from numpy import ndarray as Array
-from pydantic import Field
+from pydantic import Field, ValidationError
 from pydantic.dataclasses import dataclass
 from tqdm import tqdm
 
@@ -228,8 +228,11 @@ def main() -> None:
     torch.set_num_threads(1)  # the batches are too small for more
     evaluated = []
     for name in args.policies:  # all errors before the first trial
-        policy, trained, label = load_policy(name)
-        evaluated.append((name, label, policy, *task_of(policy, trained, args, flags)))
+        try:
+            policy, trained, label = load_policy(name)
+            evaluated.append((name, label, policy, *task_of(policy, trained, args, flags)))
+        except ValidationError as error:
+            raise SystemExit(f"{name} does not fit the code here: {error}") from None
     file = args.csv and open(args.csv, "w", encoding="utf-8", newline="")
     overall = {}
     for name, label, policy, env_id, options in evaluated:

@@ -139,7 +139,8 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     Options = Options
     REVISION = 8
-    PIECE = 4  # physics steps between two looks of the valves at the command, 20 ms
+    COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    PIECE = 0.02  # s between two looks of the valves at the command
     GROUND_WEIGHT, GROUND_MOST = 90.0, 3.0
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):

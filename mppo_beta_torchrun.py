@@ -35,6 +35,7 @@ from crane_utils import runs, trials
 from crane_utils.runs import Count, Factor, Share
 
 A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is -inf at 0 and 1
+PERTURBED = 0.4  # share of the run in which eps falls to 0
 LOG_EXCESS_MAX = 5.0  # bound of log(alpha - 1) and log(beta - 1)
 
 
@@ -55,6 +56,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
+    physics_step: Factor = 0.01  # s, in training; 0, as in evaluations, is the task's own 0.005
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -76,7 +78,6 @@ class Args:
     # schedules (docs/training.md)
     curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
     retry: Share = 0.5  # largest share of episodes that repeat a failed start
-    perturbed: Annotated[float, Field(gt=0, le=1)] = 0.4  # share of the run in which eps falls to 0
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
     narrowing: float = 2.5  # rise of the actor's outputs in the run, before the bound
 
@@ -190,7 +191,8 @@ if __name__ == "__main__":
 
     # Environments
     evaluation = {"threads": args.threads, "options": asdict(args.env)}
-    envs = trials.make_envs(args.env_id, args.num_envs, **evaluation, retry=args.retry)
+    training = evaluation | {"retry": args.retry, "physics_step": args.physics_step}
+    envs = trials.make_envs(args.env_id, args.num_envs, **training)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     if not np.all(action_space.high - action_space.low < 1e9):
         raise SystemExit(f"a Beta policy needs bounded actions, and {args.env_id} has none")
@@ -225,16 +227,15 @@ if __name__ == "__main__":
         # Schedules
         left = 1.0 - (iteration - 1.0) / num_iterations
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
-        epsilon = args.perturbation * max(0.0, 1 - (1 - left) / args.perturbed)
+        epsilon = args.perturbation * max(0.0, 1 - (1 - left) / PERTURBED)
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = 1 - (1 - args.gamma) / growth
         reward_scale = args.reward_scale / growth  # V keeps its size as the horizon grows
         envs.unwrapped.difficulty = difficulty(iteration)
 
         # Rollout
-        start = time.perf_counter()
+        start, infos, raw_obs = time.perf_counter(), [], []
         torch.set_num_threads(1)  # the batches are too small for more
-        infos, raw_obs = [], []
         for step in range(args.num_steps):
             with torch.no_grad():
                 raw_obs.append(next_obs)
@@ -253,8 +254,7 @@ if __name__ == "__main__":
                 with torch.no_grad():
                     rewards[step, cut] += gamma * agent.get_value(agent.normalize(final_obs))
 
-        # Advantages. The policy was frozen in the rollout: values and log-probabilities of all its
-        # steps come in one batch here, and not one by one in the loop above.
+        # Advantages. The policy was frozen: values and log-probabilities come in one batch here
         torch.set_num_threads(args.threads)
         b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
         with torch.no_grad():

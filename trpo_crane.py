@@ -64,6 +64,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
+    physics_step: Factor = 0.01  # s, in training; 0, as in evaluations, is the task's own 0.005
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -256,7 +257,8 @@ if __name__ == "__main__":
 
     # Environments
     evaluation = {"threads": args.threads, "options": asdict(args.env)}
-    envs = trials.make_envs(args.env_id, args.num_envs, **evaluation, retry=args.retry)
+    training = evaluation | {"retry": args.retry, "physics_step": args.physics_step}
+    envs = trials.make_envs(args.env_id, args.num_envs, **training)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
 
     # Agent
@@ -288,9 +290,8 @@ if __name__ == "__main__":
         envs.unwrapped.difficulty = difficulty(iteration)
 
         # Rollout
-        start = time.perf_counter()
+        start, infos = time.perf_counter(), []
         torch.set_num_threads(1)  # the batches are too small for more
-        infos = []
         for step in range(args.num_steps):
             with torch.no_grad():
                 agent.update_normalizer(next_obs)
@@ -307,8 +308,7 @@ if __name__ == "__main__":
                 with torch.no_grad():
                     rewards[step, cut] += gamma * agent.get_value(agent.normalize(final_obs))
 
-        # Advantages. The policy was frozen in the rollout: values and old policy of all its steps
-        # come in one batch here, and not one by one in the loop above.
+        # Advantages. The policy was frozen: values and old policy come in one batch here
         torch.set_num_threads(args.threads)
         b_obs, b_actions = obs.flatten(0, 1), actions.flatten(0, 1)
         with torch.no_grad():

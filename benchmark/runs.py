@@ -65,7 +65,7 @@ HARD = {
         RECURRENT: HYDRAULIC + "--learning-rate 7e-4 --retry 0.5",
     },
     "randomized": {
-        MPPO: RANDOMIZED + LARGE + "--learning-rate 5e-4 --perturbed 0.2",
+        MPPO: RANDOMIZED + LARGE + "--learning-rate 5e-4",
         PPO: RANDOMIZED + LARGE + "--learning-rate 5e-4",
         TRPO: RANDOMIZED + LARGE + FISHER,
         RECURRENT: RANDOMIZED + "--learning-rate 7e-4 --retry 0.5",

@@ -76,7 +76,7 @@ class PlainCrane(gymnasium.Env):
         cranes = CraneVectorEnv(1, env_threads=1, frame_skip=frame_skip)
         self.observation_space = cranes.single_observation_space
         self.action_space = cranes.single_action_space
-        self.frame_skip, self.piece, self.max_steps = frame_skip, cranes.PIECE, cranes.max_steps
+        self.frame_skip, self.piece, self.max_steps = frame_skip, cranes.piece, cranes.max_steps
         self.model, self.data, self.seconds = cranes.model, mujoco.MjData(cranes.model), 0.0
         self.kp = cranes.servo_kp[0]
         leads = self.model.jnt_actfrcrange[SERVOS, 1] / self.kp

@@ -12,7 +12,7 @@ import shutil
 import signal
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from secrets import token_hex
 from types import FrameType
@@ -62,7 +62,7 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     if checkpoint:
-        for name in ("env_id", "num_envs", "num_steps"):  # the task, and what counts the updates
+        for name in ("env_id", "num_envs", "num_steps", "hidden_sizes"):  # all that rests on them
             if getattr(args, name) != (was := getattr(default, name)):
                 raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
         batch_size = args.num_envs * args.num_steps
@@ -73,10 +73,11 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
 
 
 def restore_args(arguments: type, saved: dict[str, Any]) -> Any:
-    """`Args` as they were saved, for the same script or an edited one with more of them."""
+    """`Args` as they were saved, for the same script or an edited one with other arguments."""
     cranes = trials.crane_class(saved["task"]["env_id"])
     options = (cranes.Options if cranes else Options)(**saved["args"]["env"])
-    return arguments(**{**saved["args"], "env": options})
+    known = {f.name: saved["args"][f.name] for f in fields(arguments) if f.name in saved["args"]}
+    return arguments(**{**known, "env": options})
 
 
 def restore(
@@ -167,8 +168,8 @@ def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> N
     wrong = [name for name, value in stats.items() if value != value or abs(value) == float("inf")]
     wrong += [name for name, weights in agent.named_parameters() if not weights.isfinite().all()]
     if wrong:
-        names = ", ".join(wrong[:3])
-        raise SystemExit(f"update {iteration}: {names} not finite; try a lower --learning-rate")
+        what = f"update {iteration}: {', '.join(wrong[:3])} not finite"
+        raise SystemExit(f"{what}; try a lower --learning-rate")
 
 
 def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:

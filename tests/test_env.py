@@ -11,7 +11,7 @@ from gymnasium.wrappers.vector import DictInfoToList
 from reference_crane import FASTEST, RANGES, SLOWEST
 
 import crane_env
-from crane_env import CraneEnv, CraneVectorEnv
+from crane_env import ACTUATED, CraneEnv, CraneVectorEnv
 from hydraulic_crane import HydraulicCraneEnv, HydraulicCraneVectorEnv
 
 IDEAL, HYDRAULIC = (CraneEnv, CraneVectorEnv), (HydraulicCraneEnv, HydraulicCraneVectorEnv)
@@ -366,6 +366,24 @@ def test_what_an_edited_model_says_counts(tmp_path, monkeypatch):
     for _ in range(20):
         envs.step(np.zeros((2, 6)))
     np.testing.assert_allclose(envs.state().carried, 0, atol=0.02)  # logs lie on the ground
+
+
+@pytest.mark.parametrize("skip, physics_step, steps", [(20, 0.01, 10), (3, 0.01, 2), (1, 0.01, 1)])
+def test_coarser_physics_is_the_same_task(skip, physics_step, steps):
+    """Steps, limits and free motion are those of the exact physics, within 1 cm and 0.01 rad."""
+    kinds = [CraneVectorEnv(4, frame_skip=skip, physics_step=p) for p in (0.0, physics_step)]
+    fine, coarse = kinds
+    assert (fine.dt, fine.max_steps, fine.hold_steps) == (
+        coarse.dt, coarse.max_steps, coarse.hold_steps
+    )  # fmt: skip
+    assert (fine.frame_skip, coarse.frame_skip) == (skip, steps)
+    assert coarse.model.opt.timestep == pytest.approx(fine.dt / steps)
+    for envs in kinds:
+        envs.reset(seed=5)
+        for _ in range(round(1 / envs.dt)):
+            envs.step(np.tile([0.4, 0.5, 0.2, 0.3, 0.3, 0.2], (4, 1)))
+    moved = np.abs(fine.state().q - coarse.state().q)[:, ACTUATED]
+    assert moved.max() < 0.01 and (moved.max() == 0) == (steps == skip)
 
 
 WRONG = [

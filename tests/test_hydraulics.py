@@ -32,11 +32,13 @@ def standing(q2, q3, q4, q8, n=1, cranes=HydraulicCraneVectorEnv, **options):
     return place(np.tile(q, (n, 1)), 0.3, cranes=cranes, **options)
 
 
+@pytest.mark.parametrize("skip", [1, 2], ids=["5ms", "10ms"])  # physics of the task, of training
 @pytest.mark.parametrize("axis", range(5), ids=AXES)
-def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis):
+def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis, skip):
     """Both ways, closer at every listed instant than the model of the lab that measured it."""
     measured, inertia, labs_fit, *pose = [*AXES.values()][axis]
-    envs = standing(*pose, n=2, frame_skip=1)
+    envs = standing(*pose, n=2, frame_skip=skip, physics_step=0.005 * skip)
+    assert envs.model.opt.timestep == envs.dt == 0.005 * skip
     model, data = envs.batch.get_model(0), envs.batch.get_data(0)
     moving, momentum = np.zeros(model.nv), np.zeros(model.nv)
     moving[[[0], [1], [2], [3, 4], [7]][axis]] = 1
@@ -48,12 +50,12 @@ def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis):
         view.mass[:] *= scale
         view.inertia[:] *= scale
     put(envs, envs.state().q, 0.3)
-    hold(envs, np.zeros(6), 40)
+    hold(envs, np.zeros(6), 40 // skip)
     before, curve = envs.state().dq[:, axis], []
-    for _ in range(245):
+    for _ in range(245 // skip):
         hold(envs, 0.4 * np.eye(6)[axis] * [[-1], [1]], 1)
         curve.append((envs.state().dq[:, axis] - before) / (0.4 * SPEED_LIMITS[:, axis]))
-    steps = np.round(TIMES[: len(measured)] / 0.005).astype(int) - 1
+    steps = np.round(TIMES[: len(measured)] / envs.dt).astype(int) - 1
     assert np.abs(np.array(curve)[steps] - np.array(measured)[:, None]).max() < labs_fit
 
 

@@ -92,7 +92,7 @@ def test_a_run_on_cranes(tmp_path, monkeypatch, script):
         return scores
 
     def watched_reset(envs, **kwargs):
-        resets.append((envs.difficulty, envs.retry, envs.options.frame_skip, kwargs["seed"]))
+        resets.append((envs.difficulty, envs.retry, envs.frame_skip, kwargs["seed"]))
         return reset(envs, **kwargs)
 
     monkeypatch.setattr(trials, "evaluate", watched)
@@ -116,7 +116,7 @@ def test_a_run_on_cranes(tmp_path, monkeypatch, script):
         for name, score in scores.items():
             assert run.scalars[f"eval/{name}"][k * UPDATE] == score
     (first, *of_evaluations) = resets
-    assert first[:3] == (0.2, 0.3, 15)  # difficulty, retry, frame_skip
+    assert first[:3] == (0.2, 0.3, 8)  # difficulty, retry, physics steps of 10 ms at most
     difficulties = [update["difficulty"] for update in run.updates]
     assert difficulties == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
     assert len(of_evaluations) == 3 and {r[:3] for r in of_evaluations} == {(1.0, 0.0, 15)}
@@ -217,6 +217,7 @@ def test_a_signal_stops_after_the_update_and_resume_goes_on(tmp_path, monkeypatc
     for name, line, said in [
         (script, f"--resume {folder}", f"{8 * UPDATE} steps are done; give more --total-timesteps"),
         (script, f"--resume {folder} --num-envs 8", "--num-envs must stay 4"),
+        (script, f"--resume {folder} --hidden-sizes 9", r"--hidden-sizes must stay \(8,\)"),
         (script, "--resume nowhere", "no checkpoint.pt in nowhere"),
         (other, f"--resume {folder}", f"{script}.py wrote .*, not {other}.py"),
     ]:
