@@ -261,14 +261,9 @@ def paper_terms(state: CraneState, d_combine: Array, command: Array) -> dict[str
 
 
 def staged_terms(
-    state: CraneState,
-    distance: Array,
-    clearance: Array,
-    miss: Array,
-    command: Array,
-    closed: Array,
-    grip: Array,
-) -> dict[str, Array]:
+    state: CraneState, distance: Array, clearance: Array, miss: Array, command: Array,
+    closed: Array, grip: Array,
+) -> dict[str, Array]:  # fmt: skip
     """r_grapple pays for jaws that close near the log's centre, r_lift for a log that rises there,
     r_balance for a crane that holds still while both jaws hold the lifted log, (N,) each.
 
@@ -451,7 +446,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         done, truncated = ending != "none", ending == "time_limit"
         terminated = done & ~truncated
         success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
-        gentle = success & (self.ground_peak <= GENTLE_FORCE)
+        gentle = success & self.gentle(info)
         failure = np.select([~ok for ok in held.values()], [*held], default="")
         failure = np.where(terminated, ending, failure)
         failure[~done | success] = ""
@@ -717,6 +712,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "off_centre": info["centre_miss"] <= MAX_MISS,
         }
 
+    def gentle(self, info: dict[str, Array]) -> Array:
+        """Whether nothing was hit hard in this episode, (N,) bool. Asked of a success."""
+        return info["ground_peak"] <= GENTLE_FORCE
+
     # ---- pictures
 
     def render(self) -> tuple[Array, ...] | None:
@@ -790,11 +789,14 @@ class CraneEnv(gymnasium.Env):
 
 PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
 PAPER |= {"signed_yaw": False, "axes": "world"}
-ONE, MANY = "crane_env:CraneEnv", "crane_env:CraneVectorEnv"
-gymnasium.register("ForestryCrane-v0", ONE, vector_entry_point=MANY)
-gymnasium.register("ForestryCranePaper-v0", ONE, vector_entry_point=MANY, kwargs=PAPER)
-# beyond the paper
-ONE, MANY = "hydraulic_crane:HydraulicCraneEnv", "hydraulic_crane:HydraulicCraneVectorEnv"
-gymnasium.register("ForestryCraneHydraulic-v0", ONE, vector_entry_point=MANY)
-RANDOM = {"randomize": 1.0}
-gymnasium.register("ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs=RANDOM)
+for env_id, cranes, options in (
+    ("ForestryCrane-v0", "crane_env:", {}),
+    ("ForestryCranePaper-v0", "crane_env:", PAPER),
+    # beyond the paper
+    ("ForestryCraneHydraulic-v0", "hydraulic_crane:Hydraulic", {}),
+    ("ForestryCraneRandomized-v0", "hydraulic_crane:Hydraulic", {"randomize": 1.0}),
+    ("ForestryCraneLoading-v0", "loading_crane:Loading", {}),
+    ("ForestryCraneHydraulicLoading-v0", "loading_crane:HydraulicLoading", {}),
+):
+    one, many = f"{cranes}CraneEnv", f"{cranes}CraneVectorEnv"
+    gymnasium.register(env_id, one, vector_entry_point=many, kwargs=options)

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane_env import SPEED_LIMITS
+from crane_env import LOG_LENGTH, PIVOT_HEIGHT, SPEED_LIMITS
 
 DH = (  # a [m], d [m], alpha [rad] of q1, q2, q3, q4 stage 1, q4 stage 2, q5, q6, q7
     (-0.18, 2.425, np.pi / 2),
@@ -56,8 +56,18 @@ Q7_MAX = np.pi / 2 + 0.2  # rad; goals start within pi/2, pose errors move them 
 NEARLY_ALIGNED = 0.2  # rad; to descend
 Q8_CLOSED = 1.2  # rad; gripped: a 0.8 m log stops the jaws at 1.75 rad
 Q8_THIN, Q8_THICK = 1.8, 1.55  # rad; closing jaws meet a log of 0.3 m here, one of 0.8 m there
+BED, STAKE_TOP = 1.2, 2.7  # m
+BUNK_RADIUS = 4.1  # m, of the place in the bunk, at azimuth -pi
+LOST = 0.7  # m
+WAIT_AZIMUTH = -2.4  # rad, until the log is above the stakes
+DRAG_HEIGHT = 0.3  # m, of the log's lowest point, before it moves sideways
+JAW_OUTLINE = np.array(  # m, from a jaw's pivot, along it and outward, without its thickness
+    [[0.3164, 0.2930], [0.5402, 0.2930], [0.7378, 0.1879], [0.8490, 0.0230]]
+)
+JAW_RADIUS = 0.025  # m
+RISE_HEIGHT = 3.0  # m, of p_C
 CARRY_HEIGHT = 1.2  # m, of p_C; the log then hangs 0.8 m or more above the ground
-APPROACH, DESCEND, CLOSE, LIFT = range(4)
+APPROACH, DESCEND, CLOSE, LIFT, SWING, LOWER, OPEN, RISE = range(8)  # the last four: loading
 
 
 class Settings(NamedTuple):
@@ -85,6 +95,19 @@ class Settings(NamedTuple):
     slow_at: float = 1.2  # rad, of q8
     squeeze: float = 1.0  # command of the jaws while the crane lifts
     stalled: float = 0.1  # rad/s; slower jaws have gripped
+    over_stakes: float = 0.15  # m, of the log's lowest point when it swings
+    placed: float = 0.15  # m off the place in the bunk at most, to lower
+    still: float = 0.1  # m, swing at most, to lower
+    lower_speed: float = 0.5  # m/s
+    carry_p: float = 1.0  # 1/s
+    carry_speed: float = 2.0  # m/s
+    turn_p: float = 1.5  # 1/s
+    turn_speed: float = 1.0  # rad/s
+    lift_speed: float = 2.0  # m/s
+    touch: float = 0.02  # m
+    release: float = 0.03  # m above the height at which the jaws just clear the bed
+    q8_release: float = 0.9  # rad
+    release_speed: float = 0.25  # fraction of q8's limit
 
 
 IDEAL = Settings()
@@ -143,6 +166,13 @@ def damped_least_squares(jacobian: np.ndarray, task: np.ndarray, damping: float)
     transposed = jacobian.transpose(0, 2, 1)
     square = jacobian @ transposed + damping**2 * np.eye(task.shape[1])
     return (transposed @ np.linalg.solve(square, task[:, :, None]))[:, :, 0]
+
+
+def jaw_depth(q8: np.ndarray) -> np.ndarray:
+    """How far the jaws reach below p_C, (N,) in m. Nearly closed jaws are bulges, not tips."""
+    along, outward = JAW_OUTLINE.T[:, :, None]
+    below_pivot = np.max(along * np.sin(q8) - outward * np.cos(q8), axis=0)
+    return below_pivot + JAW_RADIUS - PIVOT_HEIGHT
 
 
 def half_turn(angle: np.ndarray) -> np.ndarray:
@@ -238,17 +268,17 @@ class ScriptedCrane:
         self.phase[(self.phase == APPROACH) & near] = DESCEND
         self.phase[(self.phase == DESCEND) & in_place] = CLOSE
         self.phase[(self.phase == CLOSE) & gripped] = LIFT
-        hovering, lifting = self.phase == APPROACH, self.phase == LIFT
+        hovering, lifting = self.phase == APPROACH, self.phase >= LIFT
 
         # Delta_p,z is 0 where the jaws' tips just clear the ground, whatever the log's diameter.
         way = delta_p + swing - settings.latency * self.velocity
         way[:, 2] += np.where(hovering, settings.hover, clearance)
-        way[lifting] = 0.0
-        way[lifting, 2] = CARRY_HEIGHT - p_plumb[lifting, 2]
+        carried, turn_of_log, jaws_of_log = self.carry(obs, p_plumb)
         wanted = bounded(settings.k_p * way, settings.max_speed)
+        wanted[lifting] = carried[lifting]
         wanted[:, :2] += settings.k_s * (swing + settings.latency * swing_rate)[:, :2]
         self.velocity += bounded(wanted - self.velocity, settings.max_acceleration * DT)
-        yaw_rate = np.where(lifting, 0.0, K_YAW * turn)
+        yaw_rate = np.where(lifting, turn_of_log, K_YAW * turn)
 
         task = np.concatenate([self.velocity, yaw_rate[:, None]], axis=-1)
         rates = SPEED * damped_least_squares(plumb_jacobian(plumb_frames) * SPEED, task, DAMPING)
@@ -259,11 +289,83 @@ class ScriptedCrane:
         meeting = (q8 > settings.slow_at) & (q8 < Q8_THIN)
         closing = np.where(meeting, settings.meeting_speed, settings.jaw_speed)
         jaws = np.where(self.phase == CLOSE, closing, jaws)
-        jaws = np.where(lifting, settings.squeeze, jaws)
+        jaws = np.where(lifting, jaws_of_log, jaws)
         return np.clip(np.concatenate([fractions, jaws[:, None]], axis=-1), -1.0, 1.0)
+
+    def carry(
+        self, obs: np.ndarray, p_plumb: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Velocity (N, 3) in m/s, turn (N,) in rad/s, command of the jaws (N,), from LIFT on.
+
+        This crane lifts. obs: what it sees. p_plumb: (N, 3) m, where the grapple hangs at rest.
+        """
+        way = np.zeros_like(p_plumb)
+        way[:, 2] = CARRY_HEIGHT - p_plumb[:, 2]
+        velocity = bounded(self.settings.k_p * way, self.settings.max_speed)
+        return velocity, np.zeros(len(obs)), np.full(len(obs), self.settings.squeeze)
 
 
 class UnsignedScriptedCrane(ScriptedCrane):
     """The same for the paper's Delta_psi, which has no sign."""
 
     signed_yaw = False
+
+
+class ScriptedLoadingCrane(ScriptedCrane):
+    """Loads the log: observations (N, 23 or more) of ForestryCraneLoading-v0.
+
+    After LIFT come SWING (over the stakes), LOWER, OPEN and RISE. It goes round the slew axis at
+    one radius, since a straight way would lead through it.
+    """
+
+    def start(self, cranes: int) -> None:
+        super().start(cranes)
+        self.spot = np.zeros((cranes, 3))  # m, p_plumb where the jaws open
+
+    def carry(
+        self, obs: np.ndarray, p_plumb: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        settings, phase = self.settings, self.phase
+        q1, q7, q8 = obs[:, 0], obs[:, 6], obs[:, 7]
+        up, angle, tilt = obs[:, 20:23].T  # to its place in the bunk
+        lowest = BED - up - LOG_LENGTH / 2 * np.sin(tilt)  # of the log, m above the ground
+        x, y, height = p_plumb.T
+        radius = np.hypot(x, y)
+        # The rotator turns against the slew to come. In the bunk its q7 is -pi/2, and between
+        # -0.6 and 0.6 before.
+        slew = -np.pi - q1
+        turn = q7 + slew + np.pi / 2 - half_turn(q7 + slew + np.pi / 2 - angle)
+
+        high = lowest > STAKE_TOP + settings.over_stakes
+        there = (np.abs(slew) * radius < settings.placed) & (np.abs(radius - BUNK_RADIUS) < settings.placed)
+        still = np.linalg.norm(self.swing[:, :2], axis=-1) < settings.still
+        # opening jaws reach deeper, and the crane rises with them
+        coming = np.where(phase >= OPEN, 1.8 * settings.release_speed * (1 / settings.k_p + settings.latency), 0.0)
+        above = height - BED - jaw_depth(np.maximum(q8 - coming, np.minimum(q8, np.pi / 2))) - settings.release
+        low = (above < 0) | (up > -settings.touch)
+        opened = q8 < settings.q8_release + 0.1
+        phase[(phase == LIFT) & high & (np.abs(turn) < NEARLY_ALIGNED)] = SWING
+        phase[(phase == SWING) & there & still & (np.abs(turn) < settings.aligned)] = LOWER
+        phase[(phase == LOWER) & low] = OPEN
+        phase[(phase == OPEN) & opened] = RISE
+        dropped = (phase >= LIFT) & (phase < LOWER) & (np.linalg.norm(obs[:, 14:17], axis=-1) > LOST)
+        phase[dropped] = APPROACH
+        self.spot = np.where((phase < OPEN)[:, None], p_plumb, self.spot)
+
+        # velocities outward, around and up
+        to_azimuth = np.where(phase == LIFT, WAIT_AZIMUTH - q1, slew)
+        way = np.stack([BUNK_RADIUS - radius, to_azimuth * radius], axis=-1)
+        cos, sin = np.cos(q1), np.sin(q1)
+        way = np.stack([way[:, 0] * cos - way[:, 1] * sin, way[:, 0] * sin + way[:, 1] * cos, 0*q1], axis=-1)
+        way[phase >= OPEN, :2] = (self.spot - p_plumb)[phase >= OPEN, :2]
+        way[(phase == LIFT) & (lowest < DRAG_HEIGHT)] = 0.0
+        velocity = bounded(settings.carry_p * (way - settings.latency * self.velocity * [1, 1, 0]), settings.carry_speed)
+        rise = STAKE_TOP + settings.over_stakes + 0.3 - lowest
+        vertical = np.select([phase <= SWING, phase <= OPEN], [rise, -above - np.where(phase == LOWER, 0.06, 0.0)], default=RISE_HEIGHT - height)
+        vertical = settings.k_p * (vertical - settings.latency * self.velocity[:, 2])
+        velocity[:, 2] = np.clip(vertical, -settings.lower_speed, settings.lift_speed)
+        release = np.clip((settings.q8_release - q8) / (DT * SPEED_LIMITS[1, 5]), -settings.release_speed, 1)
+        jaws = np.where(phase >= OPEN, release, settings.squeeze)
+        turning = (phase < OPEN) & (lowest > DRAG_HEIGHT)
+        turn = np.clip(settings.turn_p * turn, -settings.turn_speed, settings.turn_speed)
+        return velocity, np.where(turning, turn, 0.0), jaws
