@@ -446,7 +446,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         done, truncated = ending != "none", ending == "time_limit"
         terminated = done & ~truncated
         success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
-        gentle = success & self.gentle(info)
+        gentle = success & (self.ground_peak <= GENTLE_FORCE)
         failure = np.select([~ok for ok in held.values()], [*held], default="")
         failure = np.where(terminated, ending, failure)
         failure[~done | success] = ""
@@ -712,10 +712,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "off_centre": info["centre_miss"] <= MAX_MISS,
         }
 
-    def gentle(self, info: dict[str, Array]) -> Array:
-        """Whether nothing was hit hard in this episode, (N,) bool. Asked of a success."""
-        return info["ground_peak"] <= GENTLE_FORCE
-
     # ---- pictures
 
     def render(self) -> tuple[Array, ...] | None:
@@ -789,14 +785,15 @@ class CraneEnv(gymnasium.Env):
 
 PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
 PAPER |= {"signed_yaw": False, "axes": "world"}
-for env_id, cranes, options in (
-    ("ForestryCrane-v0", "crane_env:", {}),
-    ("ForestryCranePaper-v0", "crane_env:", PAPER),
-    # beyond the paper
-    ("ForestryCraneHydraulic-v0", "hydraulic_crane:Hydraulic", {}),
-    ("ForestryCraneRandomized-v0", "hydraulic_crane:Hydraulic", {"randomize": 1.0}),
-    ("ForestryCraneLoading-v0", "loading_crane:Loading", {}),
-    ("ForestryCraneHydraulicLoading-v0", "loading_crane:HydraulicLoading", {}),
-):
-    one, many = f"{cranes}CraneEnv", f"{cranes}CraneVectorEnv"
-    gymnasium.register(env_id, one, vector_entry_point=many, kwargs=options)
+ONE, MANY = "crane_env:CraneEnv", "crane_env:CraneVectorEnv"
+gymnasium.register("ForestryCrane-v0", ONE, vector_entry_point=MANY)
+gymnasium.register("ForestryCranePaper-v0", ONE, vector_entry_point=MANY, kwargs=PAPER)
+# beyond the paper
+ONE, MANY = "hydraulic_crane:HydraulicCraneEnv", "hydraulic_crane:HydraulicCraneVectorEnv"
+gymnasium.register("ForestryCraneHydraulic-v0", ONE, vector_entry_point=MANY)
+RANDOM = {"randomize": 1.0}
+gymnasium.register("ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs=RANDOM)
+ONE, MANY = "loading_crane:LoadingCraneEnv", "loading_crane:LoadingCraneVectorEnv"
+gymnasium.register("ForestryCraneLoading-v0", ONE, vector_entry_point=MANY)
+ONE, MANY = "loading_crane:HydraulicLoadingCraneEnv", "loading_crane:HydraulicLoadingCraneVectorEnv"
+gymnasium.register("ForestryCraneHydraulicLoading-v0", ONE, vector_entry_point=MANY)

@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crane_env import LOG_LENGTH, PIVOT_HEIGHT, SPEED_LIMITS
+from loading_crane import BED, PLACE_X, STAKE_TOP
 
 DH = (  # a [m], d [m], alpha [rad] of q1, q2, q3, q4 stage 1, q4 stage 2, q5, q6, q7
     (-0.18, 2.425, np.pi / 2),
@@ -56,18 +57,23 @@ Q7_MAX = np.pi / 2 + 0.2  # rad; goals start within pi/2, pose errors move them 
 NEARLY_ALIGNED = 0.2  # rad; to descend
 Q8_CLOSED = 1.2  # rad; gripped: a 0.8 m log stops the jaws at 1.75 rad
 Q8_THIN, Q8_THICK = 1.8, 1.55  # rad; closing jaws meet a log of 0.3 m here, one of 0.8 m there
-BED, STAKE_TOP = 1.2, 2.7  # m
-BUNK_RADIUS = 4.1  # m, of the place in the bunk, at azimuth -pi
-LOST = 0.7  # m
-WAIT_AZIMUTH = -2.4  # rad, until the log is above the stakes
-DRAG_HEIGHT = 0.3  # m, of the log's lowest point, before it moves sideways
 JAW_OUTLINE = np.array(  # m, from a jaw's pivot, along it and outward, without its thickness
     [[0.3164, 0.2930], [0.5402, 0.2930], [0.7378, 0.1879], [0.8490, 0.0230]]
 )
 JAW_RADIUS = 0.025  # m
-RISE_HEIGHT = 3.0  # m, of p_C
 CARRY_HEIGHT = 1.2  # m, of p_C; the log then hangs 0.8 m or more above the ground
-APPROACH, DESCEND, CLOSE, LIFT, SWING, LOWER, OPEN, RISE = range(8)  # the last four: loading
+APPROACH, DESCEND, CLOSE, LIFT = range(4)
+
+# loading
+BUNK_RADIUS, BUNK_AZIMUTH = -PLACE_X, -np.pi  # m, rad; logs start at azimuths down to -2.1
+BUNK_Q7 = -np.pi / 2  # rad, of a log along the truck
+WAIT_AZIMUTH = -2.4  # rad; any log is 1.3 m from the truck there, so it waits there to be high
+RISE_HEIGHT = 3.0  # m, of p_C; the jaws are then above the stakes
+DRAG_HEIGHT = 0.3  # m, of the log's lowest point, before it turns and moves sideways
+SLIPPED = 0.7  # m, of Delta_p; a gripped log has at most 0.5
+RELEASE_RATE = SPEED_LIMITS[1, 5]  # rad/s, of jaws that open at full command
+FREE_Q8 = 1.3  # rad; wider jaws have let go: tips 1.1 m apart
+SWING, LOWER, OPEN, RISE = range(4, 8)
 
 
 class Settings(NamedTuple):
@@ -95,19 +101,21 @@ class Settings(NamedTuple):
     slow_at: float = 1.2  # rad, of q8
     squeeze: float = 1.0  # command of the jaws while the crane lifts
     stalled: float = 0.1  # rad/s; slower jaws have gripped
-    over_stakes: float = 0.15  # m, of the log's lowest point when it swings
-    placed: float = 0.15  # m off the place in the bunk at most, to lower
-    still: float = 0.1  # m, swing at most, to lower
-    lower_speed: float = 0.5  # m/s
-    carry_p: float = 1.0  # 1/s
-    carry_speed: float = 2.0  # m/s
-    turn_p: float = 1.5  # 1/s
-    turn_speed: float = 1.0  # rad/s
-    lift_speed: float = 2.0  # m/s
-    touch: float = 0.02  # m
-    release: float = 0.03  # m above the height at which the jaws just clear the bed
-    q8_release: float = 0.9  # rad
-    release_speed: float = 0.25  # fraction of q8's limit
+    # loading
+    lift_speed: float = 2.0  # m/s at most, to rise
+    over_stakes: float = 0.15  # m, of the log's lowest point above the stakes, to swing over them
+    more: float = 0.3  # m, by which it goes on rising
+    carry_p: float = 1.0  # 1/s, like k_p; the loaded grapple swings more slowly
+    carry_speed: float = 2.0  # m/s at most, sideways
+    turn_p: float = 1.5  # 1/s; loose logs turn in the jaws when these turn fast
+    turn_speed: float = 1.0  # rad/s at most
+    placed: float = 0.45  # m off the place at most, to lower; it goes on moving there
+    still: float = 0.25  # m, swing at most, to lower
+    lower_speed: float = 0.8  # m/s at most
+    release: float = 0.06  # m, of the jaws above the bed, to open
+    touch: float = 0.02  # m, of the log above the bed, to open
+    release_speed: float = 0.25  # of the jaws, a fraction of q8's limit, until FREE_Q8
+    q8_release: float = 0.9  # rad; the tips are 1.73 m apart then, and the stakes 2.3 m
 
 
 IDEAL = Settings()
@@ -116,6 +124,10 @@ HYDRAULIC = Settings(
     hover=0.11, near=0.391, over=0.119, level=0.0442, aligned=0.0915, clearance=0.0905, rise=0.411,
     jaw_speed=0.945, meeting_speed=0.182, slow_at=1.0, squeeze=0.801, stalled=0.0441,
 )  # fmt: skip
+
+
+LOADING_IDEAL = IDEAL._replace()
+LOADING_HYDRAULIC = HYDRAULIC._replace()
 
 
 def forward_kinematics(q: np.ndarray) -> np.ndarray:
@@ -192,6 +204,7 @@ class ScriptedCrane:
     """
 
     signed_yaw = True  # False finds the sign of Delta_psi by turning
+    drives = IDEAL, HYDRAULIC
 
     def __init__(self, settings: Settings | None = None):
         self.settings = settings
@@ -203,7 +216,7 @@ class ScriptedCrane:
     ) -> tuple[np.ndarray, "ScriptedCrane"]:
         """Actions (N, 6) and the memory of this batch of trials. None starts new trials."""
         if state is None:
-            settings = self.settings or (HYDRAULIC if obs.shape[1] >= 32 else IDEAL)
+            settings = self.settings or self.drives[obs.shape[1] >= 32]
             state = type(self)(settings)
             state.start(len(obs))
         return state.act(obs), state
@@ -276,7 +289,8 @@ class ScriptedCrane:
         carried, turn_of_log, jaws_of_log = self.carry(obs, p_plumb)
         wanted = bounded(settings.k_p * way, settings.max_speed)
         wanted[lifting] = carried[lifting]
-        wanted[:, :2] += settings.k_s * (swing + settings.latency * swing_rate)[:, :2]
+        damping = settings.k_s * (swing + settings.latency * swing_rate)[:, :2]
+        wanted[:, :2] += np.where((self.phase >= OPEN)[:, None], 0.0, damping)
         self.velocity += bounded(wanted - self.velocity, settings.max_acceleration * DT)
         yaw_rate = np.where(lifting, turn_of_log, K_YAW * turn)
 
@@ -295,9 +309,9 @@ class ScriptedCrane:
     def carry(
         self, obs: np.ndarray, p_plumb: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Velocity (N, 3) in m/s, turn (N,) in rad/s, command of the jaws (N,), from LIFT on.
+        """What cranes do from LIFT on: velocity (N, 3) m/s, turn (N,) rad/s, jaws' command (N,).
 
-        This crane lifts. obs: what it sees. p_plumb: (N, 3) m, where the grapple hangs at rest.
+        This crane only lifts. p_plumb (N, 3) in m is the grapple's place when plumb.
         """
         way = np.zeros_like(p_plumb)
         way[:, 2] = CARRY_HEIGHT - p_plumb[:, 2]
@@ -314,58 +328,68 @@ class UnsignedScriptedCrane(ScriptedCrane):
 class ScriptedLoadingCrane(ScriptedCrane):
     """Loads the log: observations (N, 23 or more) of ForestryCraneLoading-v0.
 
-    After LIFT come SWING (over the stakes), LOWER, OPEN and RISE. It goes round the slew axis at
-    one radius, since a straight way would lead through it.
+    LIFT raises the log and turns it along the truck. SWING goes on over the stakes, round the slew
+    axis at the bunk's radius. LOWER ends where the log or the jaws are just above the bed. In OPEN
+    the crane rises as the opening jaws reach deeper. RISE goes straight up. A log that slips out of
+    the jaws before is grasped again.
     """
+
+    drives = LOADING_IDEAL, LOADING_HYDRAULIC
 
     def start(self, cranes: int) -> None:
         super().start(cranes)
-        self.spot = np.zeros((cranes, 3))  # m, p_plumb where the jaws open
+        self.spot = np.zeros((cranes, 3))  # m, where the jaws open
 
     def carry(
         self, obs: np.ndarray, p_plumb: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        settings, phase = self.settings, self.phase
+        settings, phase, latency = self.settings, self.phase, self.settings.latency
         q1, q7, q8 = obs[:, 0], obs[:, 6], obs[:, 7]
-        up, angle, tilt = obs[:, 20:23].T  # to its place in the bunk
+        up, angle, tilt = obs[:, 20:23].T  # from the log to its place in the bunk
         lowest = BED - up - LOG_LENGTH / 2 * np.sin(tilt)  # of the log, m above the ground
-        x, y, height = p_plumb.T
-        radius = np.hypot(x, y)
-        # The rotator turns against the slew to come. In the bunk its q7 is -pi/2, and between
-        # -0.6 and 0.6 before.
-        slew = -np.pi - q1
-        turn = q7 + slew + np.pi / 2 - half_turn(q7 + slew + np.pi / 2 - angle)
+        radius, height = np.hypot(p_plumb[:, 0], p_plumb[:, 1]), p_plumb[:, 2]
+        slew = BUNK_AZIMUTH - q1
+        # The rotator turns against the slew to come. Of the two goals, half a turn apart, that near
+        # BUNK_Q7 keeps it within 0.6 rad of its middle before.
+        ahead = q7 + slew - BUNK_Q7
+        turn = ahead - half_turn(ahead - angle)
+        # jaws that open with release_speed are this much wider when the crane has followed them
+        opening = RELEASE_RATE * settings.release_speed * (1 / settings.k_p + latency)
+        deepest = np.where(phase >= OPEN, np.maximum(q8 - opening, np.minimum(q8, np.pi / 2)), q8)
+        above = height - BED - jaw_depth(deepest) - settings.release
 
+        # phases
         high = lowest > STAKE_TOP + settings.over_stakes
-        there = (np.abs(slew) * radius < settings.placed) & (np.abs(radius - BUNK_RADIUS) < settings.placed)
+        miss = np.maximum(np.abs(slew) * radius, np.abs(radius - BUNK_RADIUS))
         still = np.linalg.norm(self.swing[:, :2], axis=-1) < settings.still
-        # opening jaws reach deeper, and the crane rises with them
-        coming = np.where(phase >= OPEN, 1.8 * settings.release_speed * (1 / settings.k_p + settings.latency), 0.0)
-        above = height - BED - jaw_depth(np.maximum(q8 - coming, np.minimum(q8, np.pi / 2))) - settings.release
-        low = (above < 0) | (up > -settings.touch)
-        opened = q8 < settings.q8_release + 0.1
+        over_place = (miss < settings.placed) & still & (np.abs(turn) < settings.aligned)
+        slipped = np.linalg.norm(obs[:, 14:17], axis=-1) > SLIPPED
         phase[(phase == LIFT) & high & (np.abs(turn) < NEARLY_ALIGNED)] = SWING
-        phase[(phase == SWING) & there & still & (np.abs(turn) < settings.aligned)] = LOWER
-        phase[(phase == LOWER) & low] = OPEN
-        phase[(phase == OPEN) & opened] = RISE
-        dropped = (phase >= LIFT) & (phase < LOWER) & (np.linalg.norm(obs[:, 14:17], axis=-1) > LOST)
-        phase[dropped] = APPROACH
-        self.spot = np.where((phase < OPEN)[:, None], p_plumb, self.spot)
+        phase[(phase == SWING) & over_place] = LOWER
+        phase[(phase == LOWER) & ((above < 0) | (up > -settings.touch))] = OPEN
+        phase[(phase == OPEN) & (q8 < settings.q8_release + 0.1)] = RISE
+        phase[((phase == LIFT) | (phase == SWING)) & slipped] = APPROACH
+        opens = phase >= OPEN
+        self.spot[~opens] = p_plumb[~opens]
 
-        # velocities outward, around and up
-        to_azimuth = np.where(phase == LIFT, WAIT_AZIMUTH - q1, slew)
-        way = np.stack([BUNK_RADIUS - radius, to_azimuth * radius], axis=-1)
-        cos, sin = np.cos(q1), np.sin(q1)
-        way = np.stack([way[:, 0] * cos - way[:, 1] * sin, way[:, 0] * sin + way[:, 1] * cos, 0*q1], axis=-1)
-        way[phase >= OPEN, :2] = (self.spot - p_plumb)[phase >= OPEN, :2]
+        # velocity
+        around = radius * np.where(phase == LIFT, WAIT_AZIMUTH - q1, slew)
+        outward, cos, sin = BUNK_RADIUS - radius, np.cos(q1), np.sin(q1)
+        way = np.stack([outward * cos - around * sin, outward * sin + around * cos], axis=-1)
+        way = np.where(opens[:, None], (self.spot - p_plumb)[:, :2], way)
         way[(phase == LIFT) & (lowest < DRAG_HEIGHT)] = 0.0
-        velocity = bounded(settings.carry_p * (way - settings.latency * self.velocity * [1, 1, 0]), settings.carry_speed)
-        rise = STAKE_TOP + settings.over_stakes + 0.3 - lowest
-        vertical = np.select([phase <= SWING, phase <= OPEN], [rise, -above - np.where(phase == LOWER, 0.06, 0.0)], default=RISE_HEIGHT - height)
-        vertical = settings.k_p * (vertical - settings.latency * self.velocity[:, 2])
-        velocity[:, 2] = np.clip(vertical, -settings.lower_speed, settings.lift_speed)
-        release = np.clip((settings.q8_release - q8) / (DT * SPEED_LIMITS[1, 5]), -settings.release_speed, 1)
-        jaws = np.where(phase >= OPEN, release, settings.squeeze)
-        turning = (phase < OPEN) & (lowest > DRAG_HEIGHT)
+        way -= latency * self.velocity[:, :2]
+        level = bounded(settings.carry_p * way, settings.carry_speed)
+        over_stakes = STAKE_TOP + settings.over_stakes + settings.more - lowest
+        down = -above - np.where(phase == LOWER, 2 * settings.release, 0.0)
+        rise = np.select([phase <= SWING, phase <= OPEN], [over_stakes, down], RISE_HEIGHT - height)
+        rise = settings.k_p * (rise - latency * self.velocity[:, 2])
+        rise = np.clip(rise, -settings.lower_speed, settings.lift_speed)
+
+        # rotator and jaws
         turn = np.clip(settings.turn_p * turn, -settings.turn_speed, settings.turn_speed)
-        return velocity, np.where(turning, turn, 0.0), jaws
+        turn[opens | (lowest < DRAG_HEIGHT)] = 0.0
+        fastest = np.where(q8 < FREE_Q8, 1.0, settings.release_speed)
+        release = np.clip((settings.q8_release - q8) / (DT * RELEASE_RATE), -fastest, 1.0)
+        jaws = np.where(opens, release, settings.squeeze)
+        return np.column_stack([level, rise]), turn, jaws
