@@ -53,17 +53,20 @@ HELD_OUT, HELD_UP = (3.8, 5.5), (4.7, 5.2)  # m, of the tip; all logs are above 
 # ---- the reward; a later stage adds to what all earlier ones pay
 
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
-LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together: a lying log keeps it
+LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
 HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
 SWING_WEIGHT = 4.0  # twice that: the way to the bunk takes twice as long
 SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start up to 2.1 away
 RADIUS_MISS = 1.5  # m off the bunk's radius at which r_swing falls to 1/e
 ALONG_WEIGHT = 1.0  # small: it grows on the way, and between the stakes a log can hardly be askew
 LOWER_WEIGHT = 3.0  # from the stakes' tops to the bed
-RELEASE_WEIGHT = 4.0  # jaws that open around a lying log; more, as they lose nothing else by it
+LOW = 0.25  # m above the bed, in the bunk, where a log counts as put down and the jaws may open:
+# closed jaws reach so far below a log of 0.3 m that it cannot be lower than 0.13 m in them
+RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
 OFF_WEIGHT = 2.0  # open jaws that touch nothing
 # The end must pay at least what staying would: most pay of a step, times 1 / (1 - gamma) at 0.99
 LOADED_PAY = 100 * (LIFTED_PAY + 16.0)
+GENTLE_BONUS = 0.5  # of it; a rough end comes sooner, and r_ground alone would not outweigh that
 
 
 def reach_of_log(state: CraneState) -> Array:
@@ -192,9 +195,9 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         terms.pop("r_balance", None)
         x, y, _ = state.log_centre.T
         lowest, inside = info["clearance"], in_bunk(state)
-        lies = inside & (lowest < BED + 5 * SETTLED)
+        low = inside & (lowest < BED + LOW)
         held = crane_env.centred(info["centre_miss"]) * state.touching.all(axis=-1)
-        held = np.where(lies, 1.0, held)
+        held = np.where(low, 1.0, held)
         up = held * np.where(inside, 1.0, np.clip(lowest / CARRY_HEIGHT, 0, 1))
         to_go = np.pi - np.abs(np.arctan2(y, x))  # rad round the slew axis
         radius_miss = (np.hypot(x, y) + PLACE_X) / RADIUS_MISS
@@ -204,18 +207,19 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         down = np.clip((STAKE_TOP - lowest) / (STAKE_TOP - BED), 0, 1)
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & ~state.touching.any(axis=-1)
+        gentle = self.ground_peak <= GENTLE_FORCE
         holds = self.conditions(state, info)
         steps = {name: self.streaks.get(name, 0) + 1 for name in holds}
         loaded = [ok & (steps[name] >= self.hold_steps) for name, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
-            terms[name] = np.where(lies, LIFTED_PAY / 3, terms[name])
+            terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
         return terms | {
             "r_height": HEIGHT_WEIGHT * up,
             "r_swing": SWING_WEIGHT * up * there,
             "r_along": ALONG_WEIGHT * up * there * along,
             "r_lower": LOWER_WEIGHT * inside * held * along * down,
-            "r_release": lies * along * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
-            "r_loaded": LOADED_PAY * np.all(loaded, axis=0),
+            "r_release": low * along * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
+            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * (1 + GENTLE_BONUS * gentle),
         }
 
     # ---- what ends an episode

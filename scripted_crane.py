@@ -126,8 +126,16 @@ HYDRAULIC = Settings(
 )  # fmt: skip
 
 
-LOADING_IDEAL = IDEAL._replace()
-LOADING_HYDRAULIC = HYDRAULIC._replace()
+LOADING_IDEAL = IDEAL._replace(
+    k_s=2.1, max_speed=2.24, max_acceleration=2.15, aligned=0.0937, still=0.3, carry_p=1.06,
+    turn_speed=1.34, lift_speed=1.13, more=0.513, release=0.0463, q8_release=0.956,
+)  # fmt: skip
+LOADING_HYDRAULIC = HYDRAULIC._replace(
+    k_s=0.705, latency=0.223, max_speed=1.36, max_acceleration=1.89, near=0.409, over=0.101,
+    level=0.0559, aligned=0.121, clearance=0.03, rise=0.1, jaw_speed=1.0, squeeze=0.69,
+    over_stakes=0.08, lower_speed=1.0, carry_speed=2.49, turn_p=0.807, lift_speed=2.5, more=0.106,
+    q8_release=0.839, release_speed=0.4,
+)  # fmt: skip
 
 
 def forward_kinematics(q: np.ndarray) -> np.ndarray:
