@@ -32,13 +32,11 @@ from hydraulic_crane import HydraulicCraneVectorEnv
 
 # ---- the bunk, as in assets/crane.xml, and what "loaded" means
 
-BED, STAKE_TOP = 1.2, 2.7  # m above the ground
-STAKE_Y = 1.2  # m from the truck's axis
+BED, STAKE_TOP, STAKE_Y = 1.2, 2.7, 1.2  # m: above the ground; from the truck's axis
 BUNK_X = (-6.5, -1.16)  # m, from the last stakes to the headboard
 PLACE_X = -4.1  # m, on the truck's axis, half way between two pairs of stakes: room for open jaws
 SETTLED = 0.01  # m, by which a lying log's lowest point may be off the surface
-MAX_ANGLE = np.radians(15)
-MAX_SPEED = 0.05  # m/s, of the log's centre
+MAX_ANGLE, MAX_SPEED = np.radians(15), 0.05  # of the log's axis from the truck's; m/s, its centre
 OPEN_Q8 = 1.2  # rad; the tips are 1.29 m apart and let go of 0.8 m
 GENTLE_SPEED = 1.0  # m/s, of a log that touches the bed; a fall of 5 cm
 LOG_VELOCITY = slice(10, 13)  # of the engine's qvel, behind the ten joints
@@ -60,8 +58,7 @@ SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start 
 RADIUS_MISS = 1.5  # m off the bunk's radius at which r_swing falls to 1/e
 ALONG_WEIGHT = 1.0  # small: it grows on the way, and between the stakes a log can hardly be askew
 LOWER_WEIGHT = 3.0  # from the stakes' tops to the bed
-LOW = 0.25  # m above the bed, in the bunk, where a log counts as put down and the jaws may open:
-# closed jaws reach so far below a log of 0.3 m that it cannot be lower than 0.13 m in them
+LOW = 0.25  # m above the bed, where jaws may open: in closed jaws a thin log gets 0.13 m near
 RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
 OFF_WEIGHT = 2.0  # open jaws that touch nothing
 # The end must pay at least what staying would: most pay of a step, times 1 / (1 - gamma) at 0.99
@@ -91,12 +88,12 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
     """N cranes that load. `info` has bed_speed: m/s, the log's fastest while it touched the bed."""
 
     REVISION = 1
-    TIME_LIMIT = 25.0
+    TIME_LIMIT = 25.0  # s; 600 trials of the scripted crane take 18.0, 99 % of them 21.3 at most
     GOALS = ("loaded",)
     SCRIPTED = "scripted_crane:ScriptedLoadingCrane"  # what eval_crane.py runs as `scripted`
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
-        # of the present episode: m/s; was the log lifted; steps since a jaw touched it; start
+        # m/s; was the log lifted, did it begin in the jaws; steps since a jaw touched it
         self.bed_speed, self.log_speed = np.zeros((2, num_envs))
         self.lifted, self.held_start = np.zeros((2, num_envs), bool)
         self.loose = np.zeros(num_envs, int)
@@ -118,16 +115,11 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         return spec
 
     def draw_episode(self, i: int) -> tuple[Array, Array, float]:
-        """With a probability of HELD_SHARE * (1 - difficulty) the jaws hold the log from the start.
-
-        The crane is then anywhere on the way to the bunk, above the stakes.
-        """
+        """A share of HELD_SHARE * (1 - difficulty) begins on the way to the bunk, log in the jaws."""
         q, log_pose, diameter = super().draw_episode(i)
-        *_, rng = self.rngs[i]
-        self.held_start[i] = self.difficulty < 1 and (
-            rng.random() < HELD_SHARE * (1 - self.difficulty)
-        )
-        if self.held_start[i]:
+        ease, (*_, rng) = 1 - self.difficulty, self.rngs[i]
+        self.held_start[i] = held = ease > 0 and rng.random() < HELD_SHARE * ease
+        if held:
             q, out, up = q.copy(), 0.0, 0.0
             while not (HELD_OUT[0] < out < HELD_OUT[1] and HELD_UP[0] < up < HELD_UP[1]):
                 q[1:4] = rng.uniform([0.3, -0.9, 0.0], [1.4, 0.6, 0.5])
@@ -157,13 +149,13 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         lever = crane_env.tip_position(q2, q3, q4)[0] + 0.18  # m up per rad of q2, DH parameters
         along = -np.cos(q2 + q3)  # m up per metre of a telescope stage
         levers = np.stack([lever, lever - 3.49288 * np.cos(q2), along, along], axis=-1)
-        weight = -self.model.opt.gravity[2] * self.batch.body("log").mass[ids]
+        weight = 9.81 * self.batch.body("log").mass[ids]  # N
         self.act[ids, 1:5] += weight * levers / self.servo_kp[ids, 1:5]
-        jaws = self.qpos[ids][:, crane_env.SERVOS[6:]]
-        self.act[ids, 6:] = jaws + self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
+        lead = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]  # full force of the jaws
+        self.act[ids, 6:] = self.qpos[ids, 8:10] + lead
         self.reach_time[ids] = 0
 
-    # ---- what is observed and measured
+    # ---- what is observed, measured and rewarded, and what ends an episode
 
     def watch_bed(self) -> None:
         """After each physics step: how fast the log was before a step in which it touches."""
@@ -173,9 +165,8 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         self.log_speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
 
     def observation_limits(self) -> Array:
-        bound = np.array([20.0, 20.0, 20.0, np.pi / 2, np.pi / 2])
-        more = [-bound * [1, 1, 1, 1, 0], bound]
-        return np.concatenate([super().observation_limits(), more], axis=-1)
+        high = np.array([20.0, 20.0, 20.0, np.pi / 2, np.pi / 2])
+        return np.column_stack([super().observation_limits(), [-high * [1, 1, 1, 1, 0], high]])
 
     def observe(self, state: CraneState) -> Array:
         """See the table above. The hydraulic crane calls this with the state that it reports."""
@@ -201,33 +192,31 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         up = held * np.where(inside, 1.0, np.clip(lowest / CARRY_HEIGHT, 0, 1))
         to_go = np.pi - np.abs(np.arctan2(y, x))  # rad round the slew axis
         radius_miss = (np.hypot(x, y) + PLACE_X) / RADIUS_MISS
-        there = np.where(inside, 1.0, np.clip(1 - to_go / SWING_ANGLE, 0, 1))
-        there *= np.where(inside, 1.0, np.exp(-(radius_miss**2)))
+        near = np.exp(-(radius_miss**2)) * np.clip(1 - to_go / SWING_ANGLE, 0, 1)
+        there = up * np.where(inside, 1.0, near)
         along = 1 - np.abs(angle_to_truck(state)) / (np.pi / 2)
         down = np.clip((STAKE_TOP - lowest) / (STAKE_TOP - BED), 0, 1)
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & ~state.touching.any(axis=-1)
-        gentle = self.ground_peak <= GENTLE_FORCE
         holds = self.conditions(state, info)
-        steps = {name: self.streaks.get(name, 0) + 1 for name in holds}
-        loaded = [ok & (steps[name] >= self.hold_steps) for name, ok in holds.items()]
+        bonus = 1 + GENTLE_BONUS * (self.ground_peak <= GENTLE_FORCE)
+        due = self.hold_steps - 1  # steps before this one
+        loaded = [ok & (self.streaks.get(name, 0) >= due) for name, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
             terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
         return terms | {
             "r_height": HEIGHT_WEIGHT * up,
-            "r_swing": SWING_WEIGHT * up * there,
-            "r_along": ALONG_WEIGHT * up * there * along,
+            "r_swing": SWING_WEIGHT * there,
+            "r_along": ALONG_WEIGHT * there * along,
             "r_lower": LOWER_WEIGHT * inside * held * along * down,
             "r_release": low * along * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
-            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * (1 + GENTLE_BONUS * gentle),
+            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * bonus,
         }
-
-    # ---- what ends an episode
 
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """log_lost: a lifted log on the ground, or off the jaws for HOLD_TIME, beside the bunk."""
-        x, y, _ = state.log_centre.T
-        beside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
+        (x, y, _), (last_stake, headboard) = state.log_centre.T, BUNK_X
+        beside = (np.abs(y) > STAKE_Y) | (x < last_stake) | (x > headboard)
         self.loose = np.where(state.touching.any(axis=-1), 0, self.loose + 1)
         dropped = (info["clearance"] < SETTLED) | (self.loose >= self.hold_steps)
         lost = self.lifted & dropped & beside
@@ -235,29 +224,27 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         return super().rules(state, info) | {"log_lost": lost, "loaded": info["safe"]}
 
     def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
         return {
             "not_in_bunk": in_bunk(state),
             "not_along": np.abs(state.log_axis[:, 0]) >= np.cos(MAX_ANGLE),
-            "moving": speed < MAX_SPEED,
+            "moving": np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1) < MAX_SPEED,
             "not_released": ~state.touching.any(axis=-1) & (state.q[:, 7] <= OPEN_Q8),
         }
-
-
-class LoadingCraneEnv(crane_env.CraneEnv):
-    """One crane that loads."""
-
-    cranes = LoadingCraneVectorEnv
 
 
 class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):
     """N hydraulic cranes that load. Its hooks call those of the loading crane."""
 
-    REVISION = 1
-    TIME_LIMIT = 30.0
+    REVISION, TIME_LIMIT = 1, 30.0
 
 
 class HydraulicLoadingCraneEnv(crane_env.CraneEnv):
     """One hydraulic crane that loads."""
 
     cranes = HydraulicLoadingCraneVectorEnv
+
+
+class LoadingCraneEnv(crane_env.CraneEnv):
+    """One crane that loads."""
+
+    cranes = LoadingCraneVectorEnv
