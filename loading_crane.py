@@ -115,7 +115,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         return spec
 
     def draw_episode(self, i: int) -> tuple[Array, Array, float]:
-        """A share of HELD_SHARE * (1 - difficulty) begins on the way to the bunk, log in the jaws."""
+        """HELD_SHARE * (1 - difficulty) of the starts: on the way to the bunk, log in the jaws."""
         q, log_pose, diameter = super().draw_episode(i)
         ease, (*_, rng) = 1 - self.difficulty, self.rngs[i]
         self.held_start[i] = held = ease > 0 and rng.random() < HELD_SHARE * ease

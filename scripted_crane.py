@@ -114,6 +114,7 @@ class Settings(NamedTuple):
     lower_speed: float = 0.8  # m/s at most
     release: float = 0.06  # m, of the jaws above the bed, to open
     touch: float = 0.02  # m, of the log above the bed, to open
+    calm: float = 0.3  # m/s at which it swings at most, to open
     release_speed: float = 0.25  # of the jaws, a fraction of q8's limit, until FREE_Q8
     q8_release: float = 0.9  # rad; the tips are 1.73 m apart then, and the stakes 2.3 m
 
@@ -128,7 +129,7 @@ HYDRAULIC = Settings(
 
 LOADING_IDEAL = IDEAL._replace(
     k_s=2.1, max_speed=2.24, max_acceleration=2.15, aligned=0.0937, still=0.3, carry_p=1.06,
-    turn_speed=1.34, lift_speed=1.13, more=0.513, release=0.0463, q8_release=0.956,
+    turn_speed=1.34, lift_speed=1.13, more=0.513, release=0.03, release_speed=0.2, q8_release=0.956,
 )  # fmt: skip
 LOADING_HYDRAULIC = HYDRAULIC._replace(
     k_s=0.705, latency=0.223, max_speed=1.36, max_acceleration=1.89, near=0.409, over=0.101,
@@ -263,7 +264,7 @@ class ScriptedCrane:
         p_centre, p_plumb = grapple_centre(frames), grapple_centre(plumb_frames)
         swing = p_centre - p_plumb
         swing_rate = 0 * swing if self.swing is None else (swing - self.swing) / DT
-        self.swing = swing
+        self.swing, self.swing_rate = swing, swing_rate
         angle = obs[:, 17]
         if not self.signed_yaw:
             angle = self.find_signed_angle(angle, frames[-1, :, :3, 0])
@@ -361,10 +362,10 @@ class ScriptedLoadingCrane(ScriptedCrane):
         # BUNK_Q7 keeps it within 0.6 rad of its middle before.
         ahead = q7 + slew - BUNK_Q7
         turn = ahead - half_turn(ahead - angle)
-        # jaws that open with release_speed are this much wider when the crane has followed them
+        # jaws that open reach deeper; they are this much wider when the crane has followed them
         opening = RELEASE_RATE * settings.release_speed * (1 / settings.k_p + latency)
-        deepest = np.where(phase >= OPEN, np.maximum(q8 - opening, np.minimum(q8, np.pi / 2)), q8)
-        above = height - BED - jaw_depth(deepest) - settings.release
+        deepest = jaw_depth(np.maximum(q8 - opening, np.minimum(q8, np.pi / 2)))
+        above = height - BED - deepest - settings.release
 
         # phases
         high = lowest > STAKE_TOP + settings.over_stakes
@@ -374,7 +375,9 @@ class ScriptedLoadingCrane(ScriptedCrane):
         slipped = np.linalg.norm(obs[:, 14:17], axis=-1) > SLIPPED
         phase[(phase == LIFT) & high & (np.abs(turn) < NEARLY_ALIGNED)] = SWING
         phase[(phase == SWING) & over_place] = LOWER
-        phase[(phase == LOWER) & ((above < 0) | (up > -settings.touch))] = OPEN
+        calm = np.linalg.norm(self.swing_rate[:, :2], axis=-1) < settings.calm
+        down = (above < 0) | (lowest < BED + settings.touch)
+        phase[(phase == LOWER) & down & calm] = OPEN
         phase[(phase == OPEN) & (q8 < settings.q8_release + 0.1)] = RISE
         phase[((phase == LIFT) | (phase == SWING)) & slipped] = APPROACH
         opens = phase >= OPEN
@@ -389,8 +392,8 @@ class ScriptedLoadingCrane(ScriptedCrane):
         way -= latency * self.velocity[:, :2]
         level = bounded(settings.carry_p * way, settings.carry_speed)
         over_stakes = STAKE_TOP + settings.over_stakes + settings.more - lowest
-        down = -above - np.where(phase == LOWER, 2 * settings.release, 0.0)
-        rise = np.select([phase <= SWING, phase <= OPEN], [over_stakes, down], RISE_HEIGHT - height)
+        sink = -above - np.where((phase == LOWER) & ~down, 2 * settings.release, 0.0)
+        rise = np.select([phase <= SWING, phase <= OPEN], [over_stakes, sink], RISE_HEIGHT - height)
         rise = settings.k_p * (rise - latency * self.velocity[:, 2])
         rise = np.clip(rise, -settings.lower_speed, settings.lift_speed)
 
