@@ -132,10 +132,10 @@ LOADING_IDEAL = IDEAL._replace(
     turn_speed=1.34, lift_speed=1.13, more=0.513, release=0.03, release_speed=0.2, q8_release=0.956,
 )  # fmt: skip
 LOADING_HYDRAULIC = HYDRAULIC._replace(
-    k_s=0.705, latency=0.223, max_speed=1.36, max_acceleration=1.89, near=0.409, over=0.101,
-    level=0.0559, aligned=0.121, clearance=0.03, rise=0.1, jaw_speed=1.0, squeeze=0.69,
-    over_stakes=0.08, lower_speed=1.0, carry_speed=2.49, turn_p=0.807, lift_speed=2.5, more=0.106,
-    q8_release=0.839, release_speed=0.4,
+    k_s=0.705, latency=0.223, max_speed=1.36, max_acceleration=1.88, near=0.355, over=0.0833,
+    level=0.0559, aligned=0.121, clearance=0.0387, rise=0.1, jaw_speed=1.0, squeeze=0.69,
+    lift_speed=2.5, over_stakes=0.08, more=0.106, carry_p=0.842, carry_speed=2.49, turn_p=0.807,
+    lower_speed=0.827, calm=0.2, release_speed=0.4, q8_release=0.839,
 )  # fmt: skip
 
 

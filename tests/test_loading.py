@@ -51,7 +51,8 @@ def put(envs, x, y, z, diameter=0.4):
         ((-4.1, 0, 1.4, np.pi), True),
         ((-4.1, 0, 1.7, 0, 0.3), False),  # one end 0.1 m deep in the bed
         ((-4.1, 0, 1.85, 0, 0.3), True),
-        ((-4.1, 0, 1.4, 0.9), False),  # across: it reaches 1.2 m aside
+        ((-4.1, 0.91, 1.4, 0.1), True),  # it leans on a stake, and one end reaches 1.25 m aside
+        ((-4.1, 0.93, 1.4, 0.1), False),
     ],
 )
 def test_in_bunk(pose, inside):
