@@ -585,9 +585,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         failed = np.zeros(self.num_envs, bool)
         self.impact[:] = 0.0
         # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
-        # lead keeps squeezing the log at zero command, as a check valve does. If a step is shorter
-        # than a piece, only every k-th step of an episode begins a piece.
-        every = max(1, self.piece // self.frame_skip)
+        # lead keeps squeezing the log at zero command, as a check valve does.
+        every = max(1, self.piece // self.frame_skip)  # steps to a piece, where they are shorter
         due = self.steps % every == 0
         left = self.frame_skip  # physics steps to go
         while left:
@@ -790,11 +789,13 @@ class CraneEnv(gymnasium.Env):
 
 PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
 PAPER |= {"signed_yaw": False, "axes": "world"}
-ONE, MANY = "crane_env:CraneEnv", "crane_env:CraneVectorEnv"
-gymnasium.register("ForestryCrane-v0", ONE, vector_entry_point=MANY)
-gymnasium.register("ForestryCranePaper-v0", ONE, vector_entry_point=MANY, kwargs=PAPER)
-# beyond the paper
-ONE, MANY = "hydraulic_crane:HydraulicCraneEnv", "hydraulic_crane:HydraulicCraneVectorEnv"
-gymnasium.register("ForestryCraneHydraulic-v0", ONE, vector_entry_point=MANY)
-RANDOM = {"randomize": 1.0}
-gymnasium.register("ForestryCraneRandomized-v0", ONE, vector_entry_point=MANY, kwargs=RANDOM)
+for name, crane, kwargs in [
+    ("ForestryCrane", "crane_env:Crane", {}),
+    ("ForestryCranePaper", "crane_env:Crane", PAPER),
+    ("ForestryCraneHydraulic", "hydraulic_crane:HydraulicCrane", {}),  # beyond the paper from here
+    ("ForestryCraneRandomized", "hydraulic_crane:HydraulicCrane", {"randomize": 1.0}),
+    ("ForestryCraneLoading", "loading_crane:LoadingCrane", {}),
+    ("ForestryCraneHydraulicLoading", "loading_crane:HydraulicLoadingCrane", {}),
+]:
+    many = f"{crane}VectorEnv"
+    gymnasium.register(f"{name}-v0", f"{crane}Env", vector_entry_point=many, kwargs=kwargs)

@@ -113,8 +113,10 @@ BUILT_IN = {
 }
 
 
-def load_policy(name: str) -> tuple[Any, dict[str, Any], str]:
+def load_policy(name: str, env_id: str | None = None) -> tuple[Any, dict[str, Any], str]:
     """A policy, the task it was trained on or written for, and a name for the tables."""
+    if name == "scripted" and env_id:  # a task may name a scripted crane of its own
+        name = getattr(trials.crane_class(env_id), "SCRIPTED", name)
     if name in BUILT_IN or (":" in name and not Path(name).exists()):
         module, _, attribute = BUILT_IN.get(name, name).partition(":")
         made = getattr(importlib.import_module(module), attribute, None)
@@ -229,7 +231,7 @@ def main() -> None:
     evaluated = []
     for name in args.policies:  # all errors before the first trial
         try:
-            policy, trained, label = load_policy(name)
+            policy, trained, label = load_policy(name, args.env_id)
             evaluated.append((name, label, policy, *task_of(policy, trained, args, flags)))
         except ValidationError as error:
             raise SystemExit(f"{name} does not fit the code here: {error}") from None

@@ -1,0 +1,250 @@
+"""Beyond the paper: the whole loading cycle. The crane lifts the log and puts it into the truck.
+
+    import gymnasium
+    envs = gymnasium.make_vec("crane_env:ForestryCraneLoading-v0", num_envs=64)
+
+Starts are those of crane_env.py. Within 25 s (hydraulic: 30 s) it must lie in the bunk, between
+the stakes, within 15 degrees of the truck's axis, slower than 0.05 m/s, with open jaws off it,
+throughout 0.5 s. This ends the episode as "loaded". A lifted log that is lost ends it, too. The
+success is gentle if the crane never pressed on ground, stakes or bed with more than 20 kN, and the
+log never touched the bed faster than 1 m/s. In `ground_peak` and `r_ground` 1 m/s counts as 20 kN.
+
+Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. They are of
+the reported state. On the machine a camera that sees the log's ends gives them, as it does Delta_p:
+joint angles and the log's pose in the crane's frame. The bunk stands still in that frame.
+
+| index | meaning                                                      | unit | low, high   |
+|-------|--------------------------------------------------------------|------|-------------|
+| 18-20 | from the log's centre to its place: ahead, left, up          | m    | -20, 20     |
+| 21    | signed angle from the log to the truck's axis, 0 is aligned  | rad  | -pi/2, pi/2 |
+| 22    | tilt of the log, 0 is level                                  | rad  | 0, pi/2     |
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy import ndarray as Array
+
+import crane_env
+from crane_env import GENTLE_FORCE, LOG_LENGTH, MIN_CLEARANCE, Q8_MAX, CraneState
+from hydraulic_crane import HydraulicCraneVectorEnv
+
+# ---- the bunk, as in assets/crane.xml, and what "loaded" means
+
+BED, STAKE_TOP, STAKE_Y = 1.2, 2.7, 1.2  # m: above the ground; from the truck's axis
+BUNK_X = (-6.5, -1.16)  # m, from the last stakes to the headboard
+PLACE_X, STAKE_GAP = -4.1, 1.6  # m: half way between two pairs of stakes; their distance
+SETTLED = 0.01  # m, by which a lying log's lowest point may be off the surface
+MAX_ANGLE, MAX_SPEED = np.radians(15), 0.05  # of the log's axis from the truck's; m/s, its centre
+OPEN_Q8 = 1.2  # rad; the tips are 1.29 m apart and let go of 0.8 m
+GENTLE_SPEED = 1.0  # m/s, of a log that touches the bed; a fall of 5 cm
+LOG_VELOCITY = slice(10, 13)  # of the engine's qvel, behind the ten joints
+
+# ---- held starts: a log in closed jaws, as stiff servos hold it (36 trials of the scripted crane)
+
+GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
+GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
+HELD_SHARE = 0.5  # of the starts at difficulty 0
+HELD_OUT, HELD_UP = (3.8, 5.5), (4.7, 5.2)  # m, of the tip; all logs are above the stakes
+
+# ---- the reward; a later stage adds to what all earlier ones pay
+
+CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
+LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
+HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
+SWING_WEIGHT = 4.0  # twice that: the way to the bunk takes twice as long
+SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start up to 2.1 away
+RADIUS_MISS = 1.5  # m off the bunk's radius at which r_swing falls to 1/e
+ALONG_WEIGHT = 1.0  # small: it grows on the way, and between the stakes a log can hardly be askew
+LOWER_WEIGHT = 3.0  # from the stakes' tops to the bed
+LOW = 0.25  # m above the bed, where jaws may open: in closed jaws a thin log gets 0.13 m near
+RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
+OFF_WEIGHT = 2.0  # open jaws that touch nothing
+# The end must pay at least what staying would: most pay of a step, times 1 / (1 - gamma) at 0.99
+LOADED_PAY = 100 * (LIFTED_PAY + 16.0)
+GENTLE_BONUS = 0.5  # of it; a rough end comes sooner, and r_ground alone would not outweigh that
+
+
+def reach_of_log(state: CraneState) -> Array:
+    """How far the log reaches from its centre along x, y, z, (N, 3) m."""
+    along = np.minimum(np.abs(state.log_axis), 1)
+    return LOG_LENGTH / 2 * along + state.diameter[:, None] / 2 * np.sqrt(1 - along**2)
+
+
+def angle_to_truck(state: CraneState) -> Array:
+    """Signed angle from the log's axis to the truck's, seen from above, (N,) rad."""
+    return (np.pi / 2 - np.arctan2(state.log_axis[:, 1], state.log_axis[:, 0])) % np.pi - np.pi / 2
+
+
+def in_bunk(state: CraneState) -> Array:
+    """Whether the log is between stakes and headboard, its lowest point below their tops, (N,)."""
+    (x, y, z), (ahead, _, down) = state.log_centre.T, reach_of_log(state).T
+    aside = STAKE_GAP / 2 * np.abs(state.log_axis[:, 1]) + state.diameter / 2  # at the stakes
+    between = (np.abs(y) + aside <= STAKE_Y) & (x - ahead >= BUNK_X[0]) & (x + ahead <= BUNK_X[1])
+    return between & (z - down >= BED - SETTLED) & (z - down < STAKE_TOP)
+
+
+class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
+    """N cranes that load. `info` has bed_speed: m/s, the log's fastest while it touched the bed."""
+
+    REVISION = 1
+    TIME_LIMIT = 25.0  # s; the scripted crane takes 18.4 s, in 99 % of 600 trials 22.1 s at most
+    GOALS = ("loaded",)
+    SCRIPTED = "scripted_crane:ScriptedLoadingCrane"  # what eval_crane.py runs as `scripted`
+
+    def __init__(self, num_envs: int = 1, **kwargs: Any):
+        # m/s; was the log lifted, did it begin in the jaws; steps since a jaw touched it
+        self.bed_speed, self.log_speed = np.zeros((2, num_envs))
+        self.lifted, self.held_start = np.zeros((2, num_envs), bool)
+        self.loose = np.zeros(num_envs, int)
+        super().__init__(num_envs, **kwargs)
+        self.observers.append(LoadingCraneVectorEnv.watch_bed)
+
+    # ---- the model and the start of an episode
+
+    def make_spec(self) -> mujoco.MjSpec:
+        """The truck joins the ground's body, so that `ground_force` feels it, too."""
+        spec = super().make_spec()
+        spec.compiler.fusestatic = True
+        force = spec.sensor("ground_force")
+        force.reftype, force.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
+        bed = spec.add_sensor(name="log_on_bed", type=mujoco.mjtSensor.mjSENS_CONTACT)
+        bed.objtype, bed.objname = mujoco.mjtObj.mjOBJ_BODY, "log"
+        bed.reftype, bed.refname = mujoco.mjtObj.mjOBJ_GEOM, "bed"
+        bed.intprm[:3] = [1, 0, 1]  # data "found", no reduction, one contact
+        return spec
+
+    def draw_episode(self, i: int) -> tuple[Array, Array, float]:
+        """HELD_SHARE * (1 - difficulty) of the starts: on the way to the bunk, log in the jaws."""
+        q, log_pose, diameter = super().draw_episode(i)
+        ease, (*_, rng) = 1 - self.difficulty, self.rngs[i]
+        self.held_start[i] = held = ease > 0 and rng.random() < HELD_SHARE * ease
+        if held:
+            q, out, up = q.copy(), 0.0, 0.0
+            while not (HELD_OUT[0] < out < HELD_OUT[1] and HELD_UP[0] < up < HELD_UP[1]):
+                q[1:4] = rng.uniform([0.3, -0.9, 0.0], [1.4, 0.6, 0.5])
+                out, up = crane_env.tip_position(*q[1:4])
+            q[0] = rng.uniform(-np.pi, q[0])
+            q[4:6] = np.pi / 2 - q[1] - q[2], np.pi / 2
+        return q, log_pose, diameter
+
+    def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
+        held, q = self.held_start[ids], q.copy()
+        q[held, 7] = np.interp(diameter[held], *GRIP_Q8)
+        super().place(ids, q, log_pose, diameter)
+        self.bed_speed[ids] = self.log_speed[ids] = self.loose[ids] = 0
+        self.lifted[ids] = held
+        if held.any():
+            self.hold(ids[held], diameter[held])
+
+    def hold(self, ids: Array, diameter: Array) -> None:
+        """Put the logs into the closed jaws of cranes `ids`; the integrators bear their weight."""
+        centre, (axis_x, axis_y) = self.sensordata[ids, :3], self.sensordata[ids, 3:5].T
+        yaw = np.arctan2(-axis_x, axis_y)
+        cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
+        pose = [centre[:, 0], centre[:, 1], centre[:, 2] + GRIP_TOP - diameter / 2]
+        self.batch.joint("log").qpos[ids] = np.stack([*pose, cos, -cos, -sin, sin], axis=-1)
+        self.batch.forward(ids, stage=crane_env.VEL)
+        q2, q3, q4 = self.qpos[ids, 1:4].T
+        lever = crane_env.tip_position(q2, q3, q4)[0] + 0.18  # m up per rad of q2, DH parameters
+        along = -np.cos(q2 + q3)  # m up per metre of a telescope stage
+        levers = np.stack([lever, lever - 3.49288 * np.cos(q2), along, along], axis=-1)
+        levers *= 9.81 * self.batch.body("log").mass[ids]  # N m and N
+        self.act[ids, 1:5] += levers / self.servo_kp[ids, 1:5]
+        squeeze = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
+        self.act[ids, 6:] = self.qpos[ids, 8:10] + squeeze
+        self.reach_time[ids] = 0
+
+    # ---- what is observed, measured and rewarded, and what ends an episode
+
+    def watch_bed(self) -> None:
+        """After each physics step: how fast the log was before a step in which it touches."""
+        hit = self.log_speed * (self.sensordata[:, 20] > 0)
+        self.bed_speed = np.maximum(self.bed_speed, hit)
+        self.impact = np.maximum(self.impact, hit * GENTLE_FORCE / GENTLE_SPEED)
+        self.log_speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
+
+    def observation_limits(self) -> Array:
+        high = np.array([20.0, 20.0, 20.0, np.pi / 2, np.pi / 2])
+        return np.column_stack([super().observation_limits(), [-high * [1, 1, 1, 1, 0], high]])
+
+    def observe(self, state: CraneState) -> Array:
+        """See the table above. The hydraulic crane calls this with the state that it reports."""
+        cos, sin, (x, y, z) = np.cos(state.q[:, 0]), np.sin(state.q[:, 0]), state.log_centre.T
+        x, y, z = PLACE_X - x, -y, BED + state.diameter / 2 - z
+        tilt = np.arcsin(np.minimum(np.abs(state.log_axis[:, 2]), 1))
+        place = [cos * x + sin * y, cos * y - sin * x, z]
+        return np.column_stack([super().observe(state), *place, angle_to_truck(state), tilt])
+
+    def measure(self, state: CraneState) -> dict[str, Array]:
+        return super().measure(state) | {"bed_speed": self.bed_speed.copy()}
+
+    def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """Terms of lifting but r_balance, which pays for standing still. Then the stages above."""
+        height = np.minimum(info["clearance"], crane_env.DESIRED_HEIGHT)  # higher pays no less
+        terms = super().reward_terms(state, info | {"clearance": height})
+        terms.pop("r_balance", None)
+        (x, y, _), lowest, inside = state.log_centre.T, info["clearance"], in_bunk(state)
+        low = inside & (lowest < BED + LOW)
+        held = crane_env.centred(info["centre_miss"]) * state.touching.all(axis=-1)
+        held = np.where(low, 1.0, held)
+        up = held * np.where(inside, 1.0, np.clip(lowest / CARRY_HEIGHT, 0, 1))
+        to_go = np.pi - np.abs(np.arctan2(y, x))  # rad round the slew axis
+        radius_miss = (np.hypot(x, y) + PLACE_X) / RADIUS_MISS
+        near = np.exp(-(radius_miss**2)) * np.clip(1 - to_go / SWING_ANGLE, 0, 1)
+        there = up * np.where(inside, 1.0, near)
+        along = 1 - np.abs(angle_to_truck(state)) / (np.pi / 2)
+        down = np.clip((STAKE_TOP - lowest) / (STAKE_TOP - BED), 0, 1)
+        opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
+        off = (opened == 1) & ~state.touching.any(axis=-1)
+        holds = self.conditions(state, info)
+        bonus = 1 + GENTLE_BONUS * (self.ground_peak <= GENTLE_FORCE)
+        due = self.hold_steps - 1  # steps before this one
+        loaded = [ok & (self.streaks.get(name, 0) >= due) for name, ok in holds.items()]
+        for name in ("r_distance", "r_grapple", "r_lift"):
+            terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
+        return terms | {
+            "r_height": HEIGHT_WEIGHT * up,
+            "r_swing": SWING_WEIGHT * there,
+            "r_along": ALONG_WEIGHT * there * along,
+            "r_lower": LOWER_WEIGHT * inside * held * along * down,
+            "r_release": low * along * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
+            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * bonus,
+        }
+
+    def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """log_lost: a lifted log on the ground, or off the jaws for HOLD_TIME, beside the bunk."""
+        (x, y, _), (last_stake, headboard) = state.log_centre.T, BUNK_X
+        beside = (np.abs(y) > STAKE_Y) | (x < last_stake) | (x > headboard)
+        self.loose = np.where(state.touching.any(axis=-1), 0, self.loose + 1)
+        dropped = (info["clearance"] < SETTLED) | (self.loose >= self.hold_steps)
+        lost = self.lifted & dropped & beside
+        self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)
+        return super().rules(state, info) | {"log_lost": lost, "loaded": info["safe"]}
+
+    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        return {
+            "not_in_bunk": in_bunk(state),
+            "not_along": np.abs(state.log_axis[:, 0]) >= np.cos(MAX_ANGLE),
+            "moving": np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1) < MAX_SPEED,
+            "not_released": ~state.touching.any(axis=-1) & (state.q[:, 7] <= OPEN_Q8),
+        }
+
+
+class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):
+    """N hydraulic cranes that load. Its hooks call those of the loading crane."""
+
+    REVISION, TIME_LIMIT = 1, 30.0
+
+
+class HydraulicLoadingCraneEnv(crane_env.CraneEnv):
+    """One hydraulic crane that loads."""
+
+    cranes = HydraulicLoadingCraneVectorEnv
+
+
+class LoadingCraneEnv(crane_env.CraneEnv):
+    """One crane that loads."""
+
+    cranes = LoadingCraneVectorEnv

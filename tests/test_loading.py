@@ -1,0 +1,164 @@
+"""Loading: what lies in the bunk, what is lost, what is gentle, held starts, the reward's order."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import loading_crane
+from crane_env import GENTLE_FORCE, CraneState, CraneVectorEnv
+from crane_utils.trials import make_envs, monte_carlo_trials, run_trials
+from loading_crane import HydraulicLoadingCraneVectorEnv, LoadingCraneVectorEnv
+from scripted_crane import ScriptedLoadingCrane
+
+CLASSES = [LoadingCraneVectorEnv, HydraulicLoadingCraneVectorEnv]
+IDLE = np.zeros((1, 6))
+
+
+def lying(x, y, z, yaw=0.0, tilt=0.0, diameter=0.4):
+    """The state of a log whose axis is turned by yaw from the truck's and by tilt from level."""
+    axis = [np.cos(tilt) * np.cos(yaw), np.cos(tilt) * np.sin(yaw), np.sin(tilt)]
+    none = np.zeros((1, 3))
+    return CraneState(
+        np.zeros((1, 8)), np.zeros((1, 6)), none, none, np.array([[x, y, z]]), np.array([axis]),
+        np.zeros((1, 2), bool), np.array([diameter]),
+    )  # fmt: skip
+
+
+def put(envs, x, y, z, diameter=0.4):
+    """One crane far from its log, which lies along the truck at (x, y) with its centre at z."""
+    envs.reset(seed=0)
+    q = envs.starts[0][0]
+    q[7] = 0.5
+    envs.place(np.arange(1), q[None], np.array([[x, y, np.pi / 2]]), np.array([diameter]))
+    envs.batch.joint("log").qpos[0, 2] = z
+    envs.batch.forward(np.arange(1), stage=loading_crane.crane_env.VEL)
+
+
+@pytest.mark.parametrize(
+    "pose, inside",
+    [
+        ((-4.1, 0, 1.4), True),  # on the bed
+        ((-4.1, 0, 1.38), False),  # in it
+        ((-4.1, 0, 2.89), True),  # its lowest point 1 cm below the stakes' tops
+        ((-4.1, 0, 2.91), False),
+        ((-4.1, 0.99, 1.4), True),  # its side 1 cm from the stakes' line
+        ((-4.1, -1.01, 1.4), False),
+        ((-5.12, 0, 1.4), True),  # ends at -6.495 and -3.745
+        ((-5.13, 0, 1.4), False),
+        ((-2.54, 0, 1.4), True),  # ends at -1.165, before the headboard
+        ((-2.53, 0, 1.4), False),
+        ((-4.1, 0, 1.4, np.pi), True),
+        ((-4.1, 0, 1.7, 0, 0.3), False),  # one end 0.1 m deep in the bed
+        ((-4.1, 0, 1.85, 0, 0.3), True),
+        ((-4.1, 0.91, 1.4, 0.1), True),  # it leans on a stake, and one end reaches 1.25 m aside
+        ((-4.1, 0.93, 1.4, 0.1), False),
+    ],
+)
+def test_in_bunk(pose, inside):
+    assert loading_crane.in_bunk(lying(*pose)) == inside
+
+
+def test_the_place_is_observed_along_the_cranes_axes():
+    """A log 1 m short of its place, 0.3 m too high and turned by 0.2 rad, seen at q1 = -pi/2."""
+    envs = LoadingCraneVectorEnv(1, env_threads=1)
+    state = lying(-3.1, 0, 1.7, yaw=-0.2)
+    state.q[:, 0] = -np.pi / 2  # ahead is -y, left is +x
+    assert envs.observe(state)[0, 18:] == pytest.approx([0, -1, -0.3, 0.2, 0], abs=1e-9)
+    limits = HydraulicLoadingCraneVectorEnv(1, env_threads=1).observation_limits()
+    assert limits.shape == (2, 37) and limits[1, 21] == np.pi / 2 and limits[1, 36] == 1
+
+
+@pytest.mark.parametrize("height, gentle", [(0.02, True), (0.1, False)])
+def test_a_released_log_is_loaded_and_gentle_if_it_did_not_fall(height, gentle):
+    """A log that falls by h meets the bed at sqrt(2 g h): 0.63 and 1.4 m/s."""
+    envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
+    put(envs, -4.1, 0, 1.4 + height)
+    for _ in range(20):
+        _, _, terminated, _, info = envs.step(IDLE)
+        if terminated:
+            break
+    assert info["termination"] == "loaded" and info["success"] and info["gentle"] == gentle
+    assert info["bed_speed"] == pytest.approx(np.sqrt(2 * 9.81 * height), rel=0.1)
+    assert (
+        info["r_loaded"] == loading_crane.LOADED_PAY * (1.5 if gentle else 1)
+        and 0.5 < info["time"] < 1.5
+    )
+
+
+def test_force_on_the_truck_counts():
+    """Jaws that are driven onto the bed; a crane that rests on the ground is felt as before."""
+    envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
+    put(envs, 8, 8, 0.2)
+    q = np.array([[-np.pi, 0.66, -0.08, 0, np.pi / 2 - 0.58, np.pi / 2, np.pi / 2, np.pi / 2]])
+    envs.place(np.arange(1), q, np.array([[8.0, 8.0, 0]]), np.array([0.4]))
+    assert 1.5 < envs.state().grapple_centre[0, 2] < 2.5
+    for _ in range(15):
+        info = envs.step(np.array([[0, -1.0, 0, 0, 0, 0]]))[-1]
+    assert info["ground_peak"] > GENTLE_FORCE
+
+
+def test_log_lost():
+    """A lifted log on the ground is lost, one that was never lifted is not, nor one in the bunk."""
+    envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
+    for lifted, place, ending in [
+        (True, (0.0, -6.0, 0.2), "log_lost"),
+        (False, (0.0, -6.0, 0.2), "none"),
+        (True, (-4.1, 0.0, 1.4), "none"),
+    ]:
+        put(envs, *place)
+        envs.lifted[:] = lifted
+        assert envs.step(IDLE)[-1]["termination"] == ending
+    put(envs, 0.0, -6.0, 2.5)  # in the air, but no jaw touches it
+    envs.lifted[:] = True
+    endings = [envs.step(IDLE)[-1]["termination"][0] for _ in range(6)]
+    assert endings[:5] == ["none"] * 5 and endings[5] == "log_lost"
+
+
+@pytest.mark.parametrize("cranes", CLASSES)
+def test_held_starts_hold(cranes, monkeypatch):
+    """The log of every diameter stays in the jaws for a second, and the crane does not sag."""
+    monkeypatch.setattr(loading_crane, "HELD_SHARE", 1.0)
+    diameters = np.repeat([0.3, 0.4, 0.55, 0.7, 0.8], 4)
+    envs = cranes(20, diameter=diameters, difficulty=0.0, env_threads=1, autoreset=False)
+    envs.reset(seed=1)
+    start, clearance = envs.state(), envs.measure(envs.state())["clearance"]
+    assert envs.held_start.all() and (clearance > loading_crane.STAKE_TOP).all()
+    for _ in range(10):
+        info = envs.step(np.zeros((20, 6)))[-1]
+        assert (info["termination"] == "none").all()
+    state = envs.state()
+    assert state.touching.all()
+    assert np.abs(state.log_centre - start.log_centre).max() < 0.02
+    envs.difficulty = 1.0
+    envs.reset(seed=1)
+    assert not envs.held_start.any() and not envs.lifted.any()
+
+
+def test_full_starts_are_those_of_the_lifting_task():
+    ours, theirs = LoadingCraneVectorEnv(4, env_threads=1), CraneVectorEnv(4, env_threads=1)
+    np.testing.assert_array_equal(ours.reset(seed=5)[0][:, :18], theirs.reset(seed=5)[0])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("env_id", ["ForestryCraneLoading-v0", "ForestryCraneHydraulicLoading-v0"])
+def test_the_ids_make_gymnasium_environments(env_id):
+    check_env(gymnasium.make(f"crane_env:{env_id}").unwrapped, skip_render_check=True)
+
+
+def test_the_scripted_crane_loads_and_later_stages_pay_more():
+    diameters, seeds = monte_carlo_trials(10_000, 1)
+    envs = make_envs("ForestryCraneLoading-v0", 6, 1, diameter=diameters)
+    results = run_trials(ScriptedLoadingCrane(), envs, seeds)
+    assert results["success"].all() and (results["termination"] == "loaded").all(), results
+    obs, _ = envs.reset(seed=seeds)
+    policy, memory, pay = ScriptedLoadingCrane(), None, {}
+    for _ in range(250):
+        actions, memory = policy.predict(obs, memory)
+        obs, reward, terminated, _, info = envs.step(actions)
+        if terminated[0]:
+            break
+        pay.setdefault(memory.phase[0], []).append((reward - info["r_ground"])[0])
+    stages = [np.mean(pay[phase]) for phase in sorted(pay)]
+    assert len(stages) >= 7 and (np.diff(stages) > 0).all(), stages
+    assert reward[0] > 100 * max(map(max, pay.values()))
