@@ -113,6 +113,13 @@ BUILT_IN = {
 }
 
 
+LEGEND = """\
+Gentle: success with at most 20 kN of the crane on the ground. Peak: median of all trials. Other
+averages are of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
+centre), medians of the others. Up: when success was safe. The paper's rule is weaker, and it
+trained for 500 million physics steps."""
+
+
 def load_policy(name: str, env_id: str | None = None) -> tuple[Any, dict[str, Any], str]:
     """A policy, the task it was trained on or written for, and a name for the tables."""
     if name == "scripted" and env_id:  # a task may name a scripted crane of its own
@@ -278,12 +285,7 @@ def main() -> None:
         print(f"\n{label} ({name}) on {', '.join([env_id, *changed])}, seed {args.seed}")
         print_table(table)
     if overall and not args.json:
-        print("Gentle: success with at most 20 kN of the crane on the ground. Peak: median of all")
-        print("trials. All other averages are of the successes: means of reach (until d_combine <")
-        print(
-            "0.35 m) and miss (from grip to log centre), medians of the others. The paper's rule is"
-        )
-        print("weaker, and it trained for 500 million physics steps.")
+        print(LEGEND)
         if len(overall) > 1:
             print()
             print_table(overall)

@@ -56,6 +56,20 @@ def test_jaws_that_close_higher_around_thick_logs_do_not_pull_the_crane_down():
     assert gentle[0] >= 3 and gentle[1] <= 1
 
 
+def test_a_crane_that_lifts_does_not_turn_the_log():
+    """A slip in the jaws shows as an angle to the log; turning after it would shake it out."""
+    turns = []
+    for phase in (scripted.APPROACH, scripted.LIFT):
+        policy = ScriptedCrane(scripted.IDEAL)
+        policy.start(1)
+        policy.phase[:] = phase
+        obs = np.zeros((1, 18))
+        obs[0, [0, 1, 2, 3, 7, 14, 17]] = -1.5, 0.6, 0.3, 0.3, 2.0, 3.0, 0.4
+        obs[:, :8] = scripted.plumb(obs[:, :8])
+        turns.append(policy.act(obs)[0, 4])
+    assert abs(turns[0]) > 0.1 and abs(turns[1]) < 1e-9
+
+
 def test_its_memory_is_that_of_one_batch_of_trials():
     """No state starts new trials, and trials side by side do not see each other's memory."""
     policy, trial = ScriptedCrane(), np.random.default_rng(0).normal(0, 2, size=(9, 2, 18))
