@@ -1,16 +1,14 @@
 """Beyond the paper: the whole loading cycle. The crane lifts the log and puts it into the truck.
 
-    envs = gymnasium.make_vec("crane_env:ForestryCraneLoading-v0", num_envs=64)
+`ForestryCraneLoading-v0`, `ForestryCraneHydraulicLoading-v0`. Starts are those of crane_env.py.
+Within 25 s (hydraulic: 30 s) it must lie in the bunk, between the stakes, within 15 degrees of the
+truck's axis, slower than 0.05 m/s, with open jaws off it, throughout 0.5 s. This ends the episode
+as "loaded". A log that is not lifted within 9 s, or is lost later, ends it, too. The success is
+gentle if the crane never pressed on ground or truck with more than 20 kN, and the log never met the
+bed faster than 1 m/s. In `ground_peak` and `r_ground` 1 m/s counts as 20 kN.
 
-Starts are those of crane_env.py. Within 25 s (hydraulic: 30 s) it must lie in the bunk, between
-the stakes, within 15 degrees of the truck's axis, slower than 0.05 m/s, with open jaws off it,
-throughout 0.5 s. This ends the episode as "loaded". A lifted log that is lost ends it, too. The
-success is gentle if the crane never pressed on ground or truck with more than 20 kN, and the log
-never met the bed faster than 1 m/s. In `ground_peak` and `r_ground` 1 m/s counts as 20 kN.
-
-Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. They are of
-the reported state. On the machine a camera that sees the log's ends gives them, as it does Delta_p:
-joint angles and the log's pose in the crane's frame. The bunk stands still in that frame.
+Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. On the
+machine joint sensors and a camera that sees both ends of the log give them, as they do Delta_p.
 
 | index | meaning                                                      | unit | low, high   |
 |-------|--------------------------------------------------------------|------|-------------|
@@ -34,6 +32,7 @@ from hydraulic_crane import HydraulicCraneVectorEnv
 BED, STAKE_TOP, STAKE_Y = 1.2, 2.7, 1.2  # m: above the ground; from the truck's axis
 BUNK_X = (-6.5, -1.16)  # m, from the last stakes to the headboard
 PLACE_X, STAKE_GAP = -4.1, 1.6  # m: half way between two pairs of stakes; their distance
+LIFT_TIME = 9.0  # s, by which a log must have been lifted: the lifting task's limit
 SETTLED = 0.01  # m, by which contacts may give way
 MAX_ANGLE, MAX_SPEED = np.radians(15), 0.05  # of the log's axis from the truck's; m/s, its ends
 OPEN_Q8 = 1.2  # rad; the tips are 1.29 m apart and let go of 0.8 m
@@ -44,24 +43,24 @@ LOG_VELOCITY, LOG_TURNING = slice(10, 13), slice(13, 15)  # of qvel; turning acr
 
 GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
 GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
-HELD_SHARE = 0.3  # of the starts at difficulty 0; with 0.5 the lift was not learned (one run)
+HELD_SHARE = 0.5  # of the starts at difficulty 0.5; none at 0, where it learns to lift, and at 1
 HELD_OUT, HELD_UP = (3.8, 5.5), (4.7, 5.2)  # m, of the tip; all logs are above the stakes
 
 # ---- the reward; a later stage adds to what all earlier ones pay
 
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
 LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
-HEIGHT_WEIGHT = 1.0  # half as much as r_lift pays for the first metre
-SWING_WEIGHT = 2.0  # twice that: the way to the bunk takes twice as long
+HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
+SWING_WEIGHT = 4.0  # twice that: the way to the bunk takes twice as long
 SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start up to 2.1 away
 RADIUS_MISS = 1.5  # m off the bunk's radius at which r_swing falls to 1/e
-ALONG_WEIGHT = 0.5  # small: it grows on the way, and between the stakes a log can hardly be askew
-LOWER_WEIGHT = 1.5  # from the stakes' tops to the bed
+ALONG_WEIGHT = 1.0  # small: it grows on the way, and between the stakes a log can hardly be askew
+LOWER_WEIGHT = 3.0  # from the stakes' tops to the bed
 LOW = 0.2  # m above the bed, where jaws may open: in closed jaws a thin log gets 0.13 m near
-RELEASE_WEIGHT = 2.0  # jaws that open there; from here on all of the above is paid in full
-OFF_WEIGHT = 1.0  # open jaws that touch nothing
+RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
+OFF_WEIGHT = 2.0  # open jaws that touch nothing
 # The end must pay more than staying: 1.5 times most pay of a step / (1 - gamma), gamma 0.99
-LOADED_PAY = 150 * (LIFTED_PAY + 8.0)
+LOADED_PAY = 150 * (LIFTED_PAY + 16.0)
 GENTLE_BONUS = 0.25  # of it; a rough end comes sooner, and r_ground alone would not outweigh that
 
 
@@ -111,10 +110,10 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         return spec
 
     def draw_episode(self, i: int) -> tuple[Array, Array, float]:
-        """HELD_SHARE * (1 - difficulty) of the starts: on the way to the bunk, log in the jaws."""
+        """Some starts at a difficulty between 0 and 1: on the way to the bunk, log in the jaws."""
         q, log_pose, diameter = super().draw_episode(i)
-        ease, (*_, rng) = 1 - self.difficulty, self.rngs[i]
-        self.held_start[i] = held = ease > 0 and rng.random() < HELD_SHARE * ease
+        (*_, rng), share = self.rngs[i], HELD_SHARE * 4 * self.difficulty * (1 - self.difficulty)
+        self.held_start[i] = held = share > 0 and rng.random() < share
         if held:
             q, out, up = q.copy(), 0.0, 0.0
             while not (HELD_OUT[0] < out < HELD_OUT[1] and HELD_UP[0] < up < HELD_UP[1]):
@@ -211,15 +210,15 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         }
 
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """log_lost: a lifted log, beside the bunk, that the crane let fall or does not touch."""
-        (x, y, _), lowest, (last_stake, headboard) = state.log_centre.T, info["clearance"], BUNK_X
-        beside = (np.abs(y) > STAKE_Y) | (x < last_stake) | (x > headboard)
-        beside |= lowest < BED - SETTLED
+        """not_lifted: LIFT_TIME is over. log_lost: a lifted log, not in the bunk, is let go."""
+        (x, y, _), lowest = state.log_centre.T, info["clearance"]
+        outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
         self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
         dropped = (self.loose > 0) & (lowest < SETTLED) | (self.loose >= self.hold_steps)
-        lost = self.lifted & dropped & beside
+        lost = self.lifted & dropped & (outside | (lowest < BED - SETTLED))
+        ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}
         self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)
-        return super().rules(state, info) | {"log_lost": lost, "loaded": info["safe"]}
+        return super().rules(state, info) | ends | {"loaded": info["safe"]}
 
     def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)

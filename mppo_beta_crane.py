@@ -73,12 +73,12 @@ class Args:
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
     hidden_sizes: tuple[Count, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    learning_rate: Factor = 1e-3  # Adam's step size at the start
+    learning_rate: Factor = 1.4e-3  # Adam's step size at the start
     gamma: Share = 0.97  # discount per step at the start
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per step
     reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
     minibatch_size: Annotated[int, Field(ge=2)] = 1024  # steps per gradient step
-    update_epochs: Count = 8  # passes over each rollout
+    update_epochs: Count = 4  # passes over each rollout
     clip_coef: Factor = 0.2  # c, bound of the ratio's change
     target_kl: Factor = 0.04  # stop after the first epoch whose mean KL exceeds this
     ent_coef: Factor = 0.0  # c_e, weight of the entropy

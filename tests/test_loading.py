@@ -120,7 +120,7 @@ def test_held_starts_hold(cranes, monkeypatch):
     """The log of every diameter stays in the jaws for a second, and the crane does not sag."""
     monkeypatch.setattr(loading_crane, "HELD_SHARE", 1.0)
     diameters = np.repeat([0.3, 0.4, 0.55, 0.7, 0.8], 4)
-    envs = cranes(20, diameter=diameters, difficulty=0.0, env_threads=1, autoreset=False)
+    envs = cranes(20, diameter=diameters, difficulty=0.5, env_threads=1, autoreset=False)
     envs.reset(seed=1)
     start, clearance = envs.state(), envs.measure(envs.state())["clearance"]
     assert envs.held_start.all() and (clearance > loading_crane.STAKE_TOP).all()
