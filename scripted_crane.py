@@ -67,7 +67,7 @@ BUNK_Q7 = -np.pi / 2  # rad, of a log along the truck
 WAIT_AZIMUTH = -2.4  # rad; any log is 1.3 m from the truck there, so it waits there to be high
 RISE_HEIGHT = 3.0  # m, of p_C; the jaws are then above the stakes
 DRAG_HEIGHT = 0.3  # m, of the log's lowest point, before it turns and moves sideways
-SLIPPED = 0.7  # m, of Delta_p; a gripped log has at most 0.5
+SLIPPED = 0.85  # m, of Delta_p; a gripped log has at most 0.7
 RELEASE_RATE = SPEED_LIMITS[1, 5]  # rad/s, of jaws that open at full command
 FREE_Q8 = 1.3  # rad; wider jaws have let go: tips 1.1 m apart
 JAW_OUTLINE = np.array(  # m, corners of assets/crane.xml: from a jaw's pivot along it, and outward
@@ -117,7 +117,9 @@ class Settings(NamedTuple):
     release: float = 0.06  # m, of the jaws above the bed, to open
     touch: float = 0.02  # m, of the log above the bed, to open
     calm: float = 0.3  # m/s at which it swings at most, to open
-    release_speed: float = 0.25  # of the jaws, a fraction of q8's limit, until FREE_Q8
+    release_speed: float = (
+        0.12  # of the jaws, a fraction of q8's limit, until FREE_Q8; 0.2 drops logs
+    )
     q8_release: float = 0.9  # rad; the tips are 1.73 m apart then, and the stakes 2.3 m
 
 
@@ -131,7 +133,7 @@ HYDRAULIC = Settings(
 
 LOADING_IDEAL = IDEAL._replace(
     k_s=2.1, max_speed=2.24, max_acceleration=2.15, aligned=0.0937, still=0.3, carry_p=1.06,
-    turn_speed=1.34, lift_speed=1.13, more=0.513, release=0.03, release_speed=0.2, q8_release=0.956,
+    turn_speed=1.34, lift_speed=1.13, more=0.513, release=0.03, q8_release=0.956,
 )  # fmt: skip
 LOADING_HYDRAULIC = HYDRAULIC._replace(
     k_s=0.705, latency=0.223, max_speed=1.36, max_acceleration=1.88, near=0.355, over=0.0833,
