@@ -69,12 +69,12 @@ class Args:
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
     hidden_sizes: tuple[Count, ...] = (256, 256)  # hidden layers of the actor and of the critic
-    learning_rate: Factor = 1e-3  # Adam's step size at the start, for the critic
+    learning_rate: Factor = 1.4e-3  # Adam's step size at the start, for the critic
     gamma: Share = 0.97  # discount per step at the start
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per step
     reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
     minibatch_size: Count = 1024  # steps per gradient step of the critic
-    update_epochs: Count = 8  # passes of the critic over each rollout
+    update_epochs: Count = 4  # passes of the critic over each rollout
     target_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
     cg_iters: Count = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
