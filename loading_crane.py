@@ -38,13 +38,6 @@ OPEN_Q8 = 1.2  # rad; the tips are 1.29 m apart and let go of 0.8 m
 GENTLE_SPEED, CONTACTS = 1.0, 4  # m/s, of a log that meets the bed, a fall of 5 cm; contacts seen
 LOG_VELOCITY, LOG_TURNING = slice(10, 13), slice(13, 15)  # of qvel; turning across its own axis
 
-# ---- held starts: a log in closed jaws, as stiff servos hold it (36 trials of the scripted crane)
-
-GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
-GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
-HELD_SHARE = 0.5  # of the starts at difficulty 0.5; none at 0, where it learns to lift, and at 1
-HELD_JOINTS = [1.1, 0.05, 0.0], [1.2, 0.15, 0.4]  # q2, q3, q4: tip 4 to 5 m out, 4.7 to 5.7 m up
-
 # ---- the reward; a later stage adds to what all earlier ones pay
 
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
@@ -90,7 +83,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         self.bed_speed = np.zeros(num_envs)  # m/s
-        self.lifted, self.held_start = np.zeros((2, num_envs), bool)
+        self.lifted = np.zeros(num_envs, bool)
         self.loose = np.zeros(num_envs, int)  # steps since the crane touched the log
         super().__init__(num_envs, **kwargs)
         bed, crane = (self.model.sensor(name).adr[0] for name in ("log_on_bed", "crane_on_log"))
@@ -112,43 +105,10 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         spec.add_sensor(name="crane_on_log", objname="K1", intprm=[1, 0, 1], **contact)
         return spec
 
-    def draw_episode(self, i: int) -> tuple[Array, Array, float]:
-        """Some starts at a difficulty between 0 and 1: on the way to the bunk, log in the jaws."""
-        q, log_pose, diameter = super().draw_episode(i)
-        (*_, rng), share = self.rngs[i], HELD_SHARE * 4 * self.difficulty * (1 - self.difficulty)
-        self.held_start[i] = held = share > 0 and rng.random() < share
-        if held:
-            q = q.copy()
-            q[0], q[1:4] = rng.uniform(-np.pi, q[0]), rng.uniform(*HELD_JOINTS)
-            q[4:6] = np.pi / 2 - q[1] - q[2], np.pi / 2
-        return q, log_pose, diameter
-
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
-        held, q = self.held_start[ids], q.copy()
-        q[held, 7] = np.interp(diameter[held], *GRIP_Q8)
         super().place(ids, q, log_pose, diameter)
         self.bed_speed[ids] = self.loose[ids] = 0
-        self.lifted[ids] = held
-        if held.any():
-            self.hold(ids[held], diameter[held])
-
-    def hold(self, ids: Array, diameter: Array) -> None:
-        """Put the logs into the closed jaws of cranes `ids`; the integrators bear their weight."""
-        centre, (axis_x, axis_y) = self.sensordata[ids, :3], self.sensordata[ids, 3:5].T
-        yaw = np.arctan2(-axis_x, axis_y)
-        cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
-        pose = [centre[:, 0], centre[:, 1], centre[:, 2] + GRIP_TOP - diameter / 2]
-        self.batch.joint("log").qpos[ids] = np.stack([*pose, cos, -cos, -sin, sin], axis=-1)
-        self.batch.forward(ids, stage=crane_env.VEL)
-        q2, q3, q4 = self.qpos[ids, 1:4].T
-        lever = crane_env.tip_position(q2, q3, q4)[0] + 0.18  # m up per rad of q2, DH parameters
-        along = -np.cos(q2 + q3)  # m up per metre of a telescope stage
-        levers = np.stack([lever, lever - 3.49288 * np.cos(q2), along, along], axis=-1)
-        levers *= 9.81 * self.batch.body("log").mass[ids]  # N m and N
-        self.act[ids, 1:5] += levers / self.servo_kp[ids, 1:5]
-        squeeze = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
-        self.act[ids, 6:] = self.qpos[ids, 8:10] + squeeze
-        self.reach_time[ids] = 0
+        self.lifted[ids] = False
 
     # ---- what is observed, measured and rewarded, and what ends an episode
 
