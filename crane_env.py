@@ -558,10 +558,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # the integrators start with the static load, so that an idle crane neither sags nor swings
         load = self.qfrc_bias[np.ix_(ids, SERVOS)]
         self.act[ids] = self.qpos[np.ix_(ids, SERVOS)] + load / self.servo_kp[ids]
-        self.steps[ids] = 0
+        self.steps[ids] = self.command[ids] = self.impact[ids] = self.ground_peak[ids] = 0
         self.reach_time[ids] = np.inf
-        for of_last_episode in (self.command, self.impact, self.ground_peak):
-            of_last_episode[ids] = 0
         for streak in self.streaks.values():
             streak[ids] = 0
 
@@ -789,7 +787,7 @@ class CraneEnv(gymnasium.Env):
 
 PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
 PAPER |= {"signed_yaw": False, "axes": "world"}
-for name, crane, kwargs in [
+for name, kind, kwargs in [
     ("ForestryCrane", "crane_env:Crane", {}),
     ("ForestryCranePaper", "crane_env:Crane", PAPER),
     ("ForestryCraneHydraulic", "hydraulic_crane:HydraulicCrane", {}),  # beyond the paper from here
@@ -797,5 +795,5 @@ for name, crane, kwargs in [
     ("ForestryCraneLoading", "loading_crane:LoadingCrane", {}),
     ("ForestryCraneHydraulicLoading", "loading_crane:HydraulicLoadingCrane", {}),
 ]:
-    many = f"{crane}VectorEnv"
-    gymnasium.register(f"{name}-v0", f"{crane}Env", vector_entry_point=many, kwargs=kwargs)
+    many = {"vector_entry_point": f"{kind}VectorEnv", "kwargs": kwargs}
+    gymnasium.register(f"{name}-v0", f"{kind}Env", **many)

@@ -1,4 +1,4 @@
-"""Loading: what lies in the bunk, what is lost, what is gentle, held starts, the reward's order."""
+"""Loading: what lies in the bunk, what is lost, what is gentle, the reward's order."""
 
 import gymnasium
 import numpy as np
