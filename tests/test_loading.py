@@ -9,7 +9,7 @@ import loading_crane
 from crane_env import GENTLE_FORCE, CraneState, CraneVectorEnv
 from crane_utils.trials import make_envs, monte_carlo_trials, run_trials
 from loading_crane import HydraulicLoadingCraneVectorEnv, LoadingCraneVectorEnv
-from scripted_crane import ScriptedLoadingCrane
+from scripted_loading import ScriptedLoadingCrane
 
 IDLE = np.zeros((1, 6))
 
@@ -95,6 +95,21 @@ def test_force_on_the_truck_counts():
     for _ in range(15):
         info = envs.step(np.array([[0, -1.0, 0, 0, 0, 0]]))[-1]
     assert info["ground_peak"] > GENTLE_FORCE
+
+
+def test_a_crane_that_stands_on_the_log_has_not_let_go():
+    envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
+    put(envs, -4.1, 0, 1.6, 0.8)
+    q = np.array([[-np.pi, 0.8, 0.0, 0, np.pi / 2 - 0.8, np.pi / 2, np.pi / 2, 0.5]])
+    envs.place(np.arange(1), q, np.array([[-4.1, 0, np.pi / 2]]), np.array([0.8]))
+    envs.batch.joint("log").qpos[0, 2] = 1.6
+    touched = []
+    for step in range(24):
+        lower = -1.0 if step < 8 else 0.0
+        info = envs.step(np.array([[0, lower, 0, 0, 0, 0]]))[-1]
+        touched.append(envs.on_log[0] > 0 and not envs.state().touching.any())
+        assert info["termination"] == "none"
+    assert all(touched[-8:]) and envs.state().q[0, 7] < 1.2
 
 
 def test_log_lost():

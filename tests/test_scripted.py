@@ -1,5 +1,7 @@
 """The scripted crane: kinematics, Jacobian, finding the sign, grasping, and two frozen trials."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,7 +52,7 @@ def test_jaws_that_close_higher_around_thick_logs_do_not_pull_the_crane_down():
     gentle = []
     for rise in (HYDRAULIC.rise, 0.0):
         envs = make_envs("ForestryCraneHydraulic-v0", 4, 1, diameter=0.7)
-        results = run_trials(ScriptedCrane(HYDRAULIC._replace(rise=rise)), envs, seeds)
+        results = run_trials(ScriptedCrane(replace(HYDRAULIC, rise=rise)), envs, seeds)
         assert results["success"].sum() >= 3
         gentle.append(results["gentle"].sum())
     assert gentle[0] >= 3 and gentle[1] <= 1
