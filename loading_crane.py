@@ -38,22 +38,31 @@ OPEN_Q8 = 1.2  # rad; the tips are 1.29 m apart and let go of 0.8 m
 GENTLE_SPEED, CONTACTS = 1.0, 4  # m/s, of a log that meets the bed, a fall of 5 cm; contacts seen
 LOG_VELOCITY, LOG_TURNING = slice(10, 13), slice(13, 15)  # of qvel; turning across its own axis
 
+# ---- easy starts on the way to the bunk: a log in closed jaws, as stiff servos hold it there
+
+HELD_SHARE = 0.4  # of the cranes at difficulty 0; none at 1
+HELD_JOINTS = [1.1, 0.05, 0.0], [1.2, 0.15, 0.4]  # q2, q3, q4: tip 4 to 5 m out, 4.7 to 5.7 m up
+GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
+GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
+
 # ---- the reward; a later stage adds to what all earlier ones pay
 
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
 LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
 HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
-SWING_WEIGHT = 4.0  # twice that: the way to the bunk takes twice as long
+SWING_WEIGHT = 3.0  # more than that: the way to the bunk takes longer
 SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start up to 2.1 away
-RADIUS_MISS = 1.5  # m off its radius at which r_swing falls to 1/e
+RADIUS_MISS = 2.5  # m off its radius at which r_swing falls to 1/e
+MIDDLE_WEIGHT, MIDDLE_MISS = 1.5, 0.6  # beside a stake jaws cannot open; m at which it is 1/e
 ALONG_WEIGHT = 1.0  # small: it grows on the way, and between the stakes a log can hardly be askew
-LOWER_WEIGHT, HIGHEST = 4.0, 4.5  # from 4.5 m to the bed; logs come over the bunk that high
+TOO_HIGH, HIGHEST = 3.6, 8.0  # m, of the lowest point: from here it pays less, from there nothing
+LOWER_WEIGHT = 4.0  # from TOO_HIGH to the bed
 LOW = 0.45  # m above the bed, where jaws may open: opening tips reach 0.24 m below a held log
-LET_GO_WEIGHT = 2.0  # jaws commanded to open there: squeezing policies find no other way to it
+MOST_ASKEW = np.radians(30)  # there; with 15 degrees jaws never opened, for a falling log tilts
+LET_GO_WEIGHT = 6.0  # jaws commanded to open there: squeezing policies find no other way to it
 RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
 OFF_WEIGHT = 2.0  # open jaws that touch nothing
-# The end must pay more than staying: 1.5 times most pay of a step / (1 - gamma), gamma 0.99
-LOADED_PAY = 150 * (LIFTED_PAY + 19.0)
+LOADED_PAY = 60 * (LIFTED_PAY + 23.5)  # more than staying: most pay of a step / (1 - gamma)
 GENTLE_BONUS = 0.25  # of it; a rough end comes sooner, and r_ground alone would not outweigh that
 
 
@@ -78,12 +87,12 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 
     REVISION, TIME_LIMIT = 1, 30.0  # s; the scripted crane takes 21 s, on hydraulic drives 25 s
     GOALS = ("loaded",)
-    GROUND_WEIGHT = 10.0  # less than for lifting: opening jaws may touch the bed
+    GROUND_WEIGHT = 3.0  # less than for lifting: opening jaws may touch the bed
     SCRIPTED = "scripted_loading:ScriptedLoadingCrane"  # what eval_crane.py runs as `scripted`
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         self.bed_speed = np.zeros(num_envs)  # m/s
-        self.lifted = np.zeros(num_envs, bool)
+        self.lifted, self.starts_held = np.zeros((2, num_envs), bool)
         self.loose = np.zeros(num_envs, int)  # steps since the crane touched the log
         super().__init__(num_envs, **kwargs)
         bed, crane = (self.model.sensor(name).adr[0] for name in ("log_on_bed", "crane_on_log"))
@@ -105,10 +114,38 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         spec.add_sensor(name="crane_on_log", objname="K1", intprm=[1, 0, 1], **contact)
         return spec
 
+    def draw_episode(self, i: int) -> tuple[Array, Array, float]:
+        """The first cranes, fewer as difficulty rises, start on the way, with the log in the jaws.
+
+        A share of the cranes and not of the starts: held episodes are long and would be most steps.
+        """
+        q, log_pose, diameter = super().draw_episode(i)
+        self.starts_held[i] = i < HELD_SHARE * (1 - self.difficulty) * self.num_envs
+        if self.starts_held[i]:
+            q, (*_, rng) = q.copy(), self.rngs[i]
+            q[0], q[1:4] = rng.uniform(-np.pi, q[0]), rng.uniform(*HELD_JOINTS)
+            q[4:6] = np.pi / 2 - q[1] - q[2], np.pi / 2
+            q[7] = np.interp(diameter, *GRIP_Q8)
+        return q, log_pose, diameter
+
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         super().place(ids, q, log_pose, diameter)
         self.bed_speed[ids] = self.loose[ids] = 0
-        self.lifted[ids] = False
+        self.lifted[ids] = held = self.starts_held[ids]
+        if held.any():
+            self.hold(ids[held], diameter[held])
+
+    def hold(self, ids: Array, diameter: Array) -> None:
+        """Put the logs into the jaws of cranes `ids`. They sag by 1 cm, on soft drives by 0.2 m."""
+        (x, y, z), (axis_x, axis_y) = self.sensordata[ids, :3].T, self.sensordata[ids, 3:5].T
+        z += GRIP_TOP - diameter / 2
+        yaw = np.arctan2(-axis_x, axis_y)
+        cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
+        self.batch.joint("log").qpos[ids] = np.stack([x, y, z, cos, -cos, -sin, sin], axis=-1)
+        self.batch.forward(ids, stage=crane_env.VEL)
+        squeeze = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
+        self.act[ids, 6:] = self.qpos[ids, 8:10] + squeeze
+        self.reach_time[ids] = 0
 
     # ---- what is observed, measured and rewarded, and what ends an episode
 
@@ -143,16 +180,17 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         over = over_bunk(state) & (lowest >= BED - HIT)
         askew = np.arccos(np.minimum(np.abs(state.log_axis[:, 0]), 1))  # rad, turned or tilted
-        low = over & (lowest < BED + LOW) & (askew < MAX_ANGLE)
+        low = over & (lowest < BED + LOW) & (askew < MOST_ASKEW)
         held = crane_env.centred(info["centre_miss"]) * state.touching.all(axis=-1)
-        held = np.where(low, 1.0, held)
-        up = held * np.where(over, 1.0, np.clip(lowest / CARRY_HEIGHT, 0, 1))
+        held[low] = 1.0
+        high = 1 - (lowest - TOO_HIGH) / (HIGHEST - TOO_HIGH)
+        up = np.clip(np.where(over, high, np.minimum(lowest / CARRY_HEIGHT, high)), 0, 1) * held
         to_go = np.pi - np.abs(np.arctan2(y, x))  # rad round the slew axis
         radius_miss = (np.hypot(x, y) + PLACE_X) / RADIUS_MISS
         near = np.exp(-(radius_miss**2)) * np.clip(1 - to_go / SWING_ANGLE, 0, 1)
-        there = up * np.where(over, 1.0, near)
+        there, middle = up * near, over * np.exp(-((y / MIDDLE_MISS) ** 2))
         along = 1 - askew / (np.pi / 2)
-        down = np.clip((HIGHEST - lowest) / (HIGHEST - BED), 0, 1)
+        down = np.clip((TOO_HIGH - lowest) / (TOO_HIGH - BED), 0, 1)
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
         lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
@@ -164,7 +202,8 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
             "r_height": HEIGHT_WEIGHT * up,
             "r_swing": SWING_WEIGHT * there,
             "r_along": ALONG_WEIGHT * there * along,
-            "r_lower": LOWER_WEIGHT * over * held * along * down,
+            "r_middle": MIDDLE_WEIGHT * up * middle,
+            "r_lower": LOWER_WEIGHT * over * held * along * down * (1 + middle) / 2,
             "r_let_go": LET_GO_WEIGHT * low * along * lets_go,
             "r_release": low * along * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
             "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * (1 + GENTLE_BONUS * gentle),

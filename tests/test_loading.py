@@ -134,6 +134,22 @@ def test_full_starts_are_those_of_the_lifting_task():
     np.testing.assert_array_equal(ours.reset(seed=5)[0][:, :18], theirs.reset(seed=5)[0])
 
 
+@pytest.mark.parametrize("cranes", [LoadingCraneVectorEnv, HydraulicLoadingCraneVectorEnv])
+def test_easy_starts_of_the_first_cranes_hold_the_log(cranes):
+    """40 % of the cranes at difficulty 0, fewer at 0.5, none at 1, and none drops its log."""
+    envs = cranes(20, env_threads=1)
+    for difficulty, held in [(0.0, 8), (0.5, 4), (1.0, 0)]:
+        envs.difficulty = difficulty
+        envs.reset(seed=7)
+        high = envs.state().log_centre[:, 2] > 2.5
+        np.testing.assert_array_equal(high, np.arange(20) < held)
+        for _ in range(10):
+            ends = envs.step(np.zeros((20, 6)))[-1]["termination"]
+            assert (ends[:held] == "none").all(), ends
+        state = envs.state()
+        assert state.touching[:held].all() and (state.log_centre[:held, 2] > 2.0).all()
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("env_id", ["ForestryCraneLoading-v0", "ForestryCraneHydraulicLoading-v0"])
 def test_the_ids_make_gymnasium_environments(env_id):
@@ -155,4 +171,4 @@ def test_the_scripted_crane_loads_and_later_stages_pay_more():
         pay.setdefault(memory.phase[0], []).append((reward - info["r_ground"])[0])
     stages = [np.mean(pay[phase]) for phase in sorted(pay)]
     assert len(stages) >= 7 and (np.diff(stages) > 0).all(), stages
-    assert reward[0] > 100 * max(map(max, pay.values()))
+    assert reward[0] > 67 * max(map(max, pay.values()))  # 1 / (1 - gamma) at the end of a training
