@@ -54,7 +54,7 @@ SWING_WEIGHT = 3.0  # more than that: the way to the bunk takes longer
 SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start up to 2.1 away
 RADIUS_MISS = 2.5  # m off its radius at which r_swing falls to 1/e
 MIDDLE_WEIGHT, MIDDLE_MISS = 1.5, 0.6  # beside a stake jaws cannot open; m at which it is 1/e
-ALONG_WEIGHT = 1.0  # small: it grows on the way, and between the stakes a log can hardly be askew
+ALONG_WEIGHT = 2.0  # of it also what lets go of the log depends: later it cannot be turned
 TOO_HIGH, HIGHEST = 3.6, 8.0  # m, of the lowest point: from here it pays less, from there nothing
 LOWER_WEIGHT = 4.0  # from TOO_HIGH to the bed
 LOW = 0.45  # m above the bed, where jaws may open: opening tips reach 0.24 m below a held log
@@ -62,8 +62,8 @@ MOST_ASKEW = np.radians(30)  # there; with 15 degrees jaws never opened, for a f
 LET_GO_WEIGHT = 6.0  # jaws commanded to open there: squeezing policies find no other way to it
 RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
 OFF_WEIGHT = 2.0  # open jaws that touch nothing
-LOADED_PAY = 60 * (LIFTED_PAY + 23.5)  # more than staying: most pay of a step / (1 - gamma)
-GENTLE_BONUS = 0.25  # of it; a rough end comes sooner, and r_ground alone would not outweigh that
+LOADED_PAY = 60 * (LIFTED_PAY + 24.5)  # more than staying: most pay of a step / (1 - gamma)
+GENTLE_BONUS = 0.5  # of r_release and of this; r_ground alone would not outweigh a sooner end
 
 
 def over_bunk(state: CraneState) -> Array:
@@ -189,12 +189,13 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         radius_miss = (np.hypot(x, y) + PLACE_X) / RADIUS_MISS
         near = np.exp(-(radius_miss**2)) * np.clip(1 - to_go / SWING_ANGLE, 0, 1)
         there, middle = up * near, over * np.exp(-((y / MIDDLE_MISS) ** 2))
-        along = 1 - askew / (np.pi / 2)
+        along, straight = 1 - askew / (np.pi / 2), np.clip(1 - askew / MOST_ASKEW, 0, 1)
         down = np.clip((TOO_HIGH - lowest) / (TOO_HIGH - BED), 0, 1)
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
         lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
-        gentle, holds = self.ground_peak <= GENTLE_FORCE, self.conditions(state, info)
+        gentle = 1 + GENTLE_BONUS * (self.ground_peak <= GENTLE_FORCE)
+        holds = self.conditions(state, info)
         loaded = [ok & (self.streaks.get(k, 0) >= self.hold_steps - 1) for k, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
             terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
@@ -204,9 +205,9 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
             "r_along": ALONG_WEIGHT * there * along,
             "r_middle": MIDDLE_WEIGHT * up * middle,
             "r_lower": LOWER_WEIGHT * over * held * along * down * (1 + middle) / 2,
-            "r_let_go": LET_GO_WEIGHT * low * along * lets_go,
-            "r_release": low * along * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
-            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * (1 + GENTLE_BONUS * gentle),
+            "r_let_go": LET_GO_WEIGHT * low * straight * lets_go,
+            "r_release": low * straight * gentle * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
+            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * gentle,
         }
 
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:

@@ -79,10 +79,8 @@ def test_a_released_log_is_loaded_and_gentle_if_it_did_not_fall(height, gentle):
             break
     assert info["termination"] == "loaded" and info["success"] and info["gentle"] == gentle
     assert info["bed_speed"] == pytest.approx(np.sqrt(2 * 9.81 * height), rel=0.1)
-    assert (
-        info["r_loaded"] == loading_crane.LOADED_PAY * (1.25 if gentle else 1)
-        and 0.5 < info["time"] < 1.5
-    )
+    bonus = loading_crane.GENTLE_BONUS if gentle else 0
+    assert info["r_loaded"] == loading_crane.LOADED_PAY * (1 + bonus) and 0.5 < info["time"] < 1.5
 
 
 def test_force_on_the_truck_counts():
@@ -171,4 +169,4 @@ def test_the_scripted_crane_loads_and_later_stages_pay_more():
         pay.setdefault(memory.phase[0], []).append((reward - info["r_ground"])[0])
     stages = [np.mean(pay[phase]) for phase in sorted(pay)]
     assert len(stages) >= 7 and (np.diff(stages) > 0).all(), stages
-    assert reward[0] > 67 * max(map(max, pay.values()))  # 1 / (1 - gamma) at the end of a training
+    assert reward[0] > 50 * max(map(max, pay.values()))  # 1 / (1 - gamma) at the end of a training
