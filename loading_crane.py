@@ -235,7 +235,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):
     """N hydraulic cranes that load. Its hooks call those of the loading crane."""
 
-    REVISION, GROUND_WEIGHT = 1, 30.0
+    REVISION, GROUND_WEIGHT = 1, 10.0
 
 
 class HydraulicLoadingCraneEnv(crane_env.CraneEnv):

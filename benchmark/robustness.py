@@ -2,6 +2,7 @@
 
     python benchmark/robustness.py levels     # results/levels.csv: the other levels
     python benchmark/robustness.py changes    # results/robustness.csv: a hydraulic crane, changed
+    python benchmark/robustness.py loading    # results/loading.csv: the scripted crane loads
     python benchmark/robustness.py held       # results/held.csv: ten more seconds without command
     python benchmark/robustness.py changes --trials 1 --folder /tmp/test    # does it work?
 
@@ -26,13 +27,14 @@ import tyro
 from tqdm import tqdm
 
 import eval_crane
-from benchmark.runs import LABELS, LEVELS, METRICS, RESULTS, ROOT, read_rows, write_rows
+from benchmark.runs import LABELS, LEVELS, LOADING, METRICS, RESULTS, ROOT, read_rows, write_rows
 from crane_env import ACTION_OF_SERVO, SERVOS
 from crane_utils import runs
 from crane_utils import trials as protocol
 from crane_utils.trials import REPORT_SEED
 from hydraulic_crane import PUMP_FLOW, HydraulicCraneVectorEnv, oil_per_movement
 from scripted_crane import ScriptedCrane
+from scripted_loading import ScriptedLoadingCrane
 
 METHODS = {label: script for script, label in LABELS.items()} | {"scripted": "scripted"}
 CHANGES = {  # attribute of ChangedCranes: what the tables call it, and its values
@@ -126,6 +128,13 @@ def levels(trials: int = 100, folder: Path = RESULTS) -> None:
         add_row(folder / "levels.csv", key, policy, trained_on, LEVELS[level])
 
 
+def loading(trials: int = 100, folder: Path = RESULTS) -> None:
+    """Write loading.csv: the scripted crane on the loading tasks."""
+    for level, env_id in LOADING.items():
+        key = {"method": "scripted", "level": level, "per_diameter": trials}
+        add_row(folder / "loading.csv", key, ScriptedLoadingCrane(), level, env_id)
+
+
 def changes(trials: int = 25, folder: Path = RESULTS) -> None:
     """Write robustness.csv: policies on hydraulic cranes with one of CHANGES."""
     policies = {method: policy_of(method, "hydraulic")[0] for method in METHODS}
@@ -173,5 +182,5 @@ def held(trials: int = 100, folder: Path = RESULTS) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    commands = {"levels": levels, "changes": changes, "held": held}
+    commands = {"levels": levels, "changes": changes, "loading": loading, "held": held}
     tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)

@@ -10,8 +10,8 @@ there, it is not made again. Two trainings run side by side with one thread each
 alone with two. Ctrl-C stops them after their update, and the next call resumes them from
 benchmark/runs/. After a change of the task delete that folder.
 
-Final policies of curves/, levels/ and short/ get 600 trials of seed 60000 with exact pose and 600
-with pose errors: benchmark/results/evaluations.csv, without runs whose own file is gone.
+Final policies of curves/, levels/, loading/ and short/ get 600 trials of seed 60000 with exact pose
+and 600 with pose errors: benchmark/results/evaluations.csv, without runs whose own file is gone.
 """
 
 import csv
@@ -43,6 +43,7 @@ LEVELS = {
     "hydraulic": "ForestryCraneHydraulic-v0",
     "randomized": "ForestryCraneRandomized-v0",
 }
+LOADING = {"ideal": "ForestryCraneLoading-v0", "hydraulic": "ForestryCraneHydraulicLoading-v0"}
 LABELS = {  # of the scripts, in figures and tables
     "mppo_beta_crane": "mPPO",
     "ppo_crane": "PPO",
@@ -71,6 +72,9 @@ HARD = {
         RECURRENT: RANDOMIZED + "--learning-rate 7e-4 --retry 0.5",
     },
 }
+CYCLE = f"--env-id {LOADING['ideal']} --total-timesteps 5120000 --learning-rate 1e-3 "
+CYCLE += "--curriculum 0.25 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
+CYCLE += "--eval-every 125"
 ABLATIONS = {  # what it is in the figure, script and flags
     "default": ("mPPO, default", MPPO, ""),
     "exact": ("trained with the task's own physics steps, 5 ms", MPPO, "--physics-step 0"),
@@ -98,6 +102,7 @@ TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
     *[("levels", f"{script}_{level}", script, flags, FIVE if level == "hydraulic" else THREE)
       for level in HARD for script, flags in HARD[level].items()],
+    ("loading", f"{MPPO}_ideal", MPPO, CYCLE, THREE),
     ("short", MPPO, MPPO, "--total-timesteps 512000 --eval-every 8", THREE),
     ("timed", MPPO, MPPO, EXACT, [21]),
     *[("timed", f"{MPPO}_{level}", MPPO, HARD[level][MPPO] + EXACT, [21]) for level in HARD],
@@ -219,7 +224,7 @@ def make(run: Run, here: Path, quick: bool) -> str:
     rows = export(folder)
     if rows[-1]["eval_episodic_return"] == "":
         return f"stopped: {run} was killed in its last evaluation, delete {folder}"
-    if run.folder in ("curves", "levels", "short"):
+    if run.folder in ("curves", "levels", "loading", "short"):
         for noise in ("none", "step"):
             key = {"run": label, "seed": run.seed, "pose_noise": noise, "trial_seed": REPORT_SEED}
             short = ["--trials", "1"] if quick else []

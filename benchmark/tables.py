@@ -14,6 +14,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable
+from itertools import product
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -23,7 +24,7 @@ import tyro
 from tqdm import tqdm
 
 from benchmark import runs
-from benchmark.runs import LABELS, LEVELS, RESULTS, Curve, read_curves, read_rows
+from benchmark.runs import LABELS, LEVELS, LOADING, RESULTS, Curve, read_curves, read_rows
 from crane_utils.trials import DIAMETERS, crane_class
 from eval_crane import PAPER
 
@@ -35,9 +36,10 @@ def table(header: list[str], lines: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["--"] * len(header), *lines])
 
 
-def evaluations(script: str, level: str, noise: str = "none") -> list[dict[str, str]]:
-    """The rows of a script's runs on a level, one a seed."""
-    run = f"curves_{script}" if level == "ideal" else f"levels_{script}_{level}"
+def evaluations(script: str, level: str, noise: str = "none", folder: str = "levels") -> list[dict]:
+    """The rows of a script's runs on a level, one a seed. folder: loading for the loading cycle."""
+    lifts_ideal = (folder, level) == ("levels", "ideal")
+    run = f"curves_{script}" if lifts_ideal else f"{folder}_{script}_{level}"
     rows = read_rows(RESULTS / "evaluations.csv")
     return [row for row in rows if (row["run"], row["pose_noise"]) == (run, noise)]
 
@@ -86,6 +88,21 @@ def seeds() -> str:
             lines.append(line + [joined(numbers(rows, name), 1, "-") for name in metrics])
     header = ["level", "method", "steps [million]", "seeds", "success", "mean", "gentle", "mean"]
     return table([*header, "energy [kJ]", "up [s]"], lines)
+
+
+def loading() -> str:
+    """evaluations.csv and loading.csv: policies and the scripted crane in the loading cycle."""
+    names, lines = ("success", "gentle", "up [s]", "oil [l]", "energy [kJ]"), []
+    for level, (script, method) in product(LOADING, LABELS.items()):
+        if rows := evaluations(script, level, folder="loading"):
+            of_seed = read_curves("loading")[f"{script}_{level}"].values()
+            steps = dict.fromkeys(f"{run['steps'][-1] / 1e6:.2f}" for run in of_seed)
+            line = [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)]
+            lines.append(line + [joined(numbers(rows, name), 1, "-") for name in names])
+    for row in read_rows(RESULTS / "loading.csv"):
+        lines.append([row["level"], "scripted", "", "", *[row[name] for name in names]])
+    header = ["level", "method", "steps [million]", "seeds", "success", "gentle", "loaded [s]"]
+    return table([*header, "oil [l]", "energy [kJ]"], lines)
 
 
 def steps_to(run: Curve, level: float) -> float:
@@ -183,7 +200,7 @@ def held() -> str:
     return table(["policy", *LEVELS], lines)
 
 
-ALL = (results, seeds, learning, paper, costs, held, timed, speed, leaderboard)
+ALL = (results, seeds, loading, learning, paper, costs, held, timed, speed, leaderboard)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 
