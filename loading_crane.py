@@ -1,13 +1,14 @@
 """Beyond the paper: the whole loading cycle. The crane lifts the log and puts it into the truck.
 
-Starts are those of crane_env.py. Within 30 s the log must lie in the bunk, between the stakes,
-within 15 degrees of the truck's axis, slower than 0.05 m/s, with open jaws off it, throughout 0.5
-s. This ends the episode as "loaded". A log that is not lifted within 12 s, or is lost later, ends
-it, too. The success is gentle if the crane never pressed on ground or truck with more than 20 kN,
-and the log never met the bed faster than 1 m/s. In `ground_peak` 1 m/s counts as 20 kN.
+Starts and rules are those of crane_env.py; easy tasks also start on the way. Within 30 s the log
+must lie in the bunk, between the stakes, within 15 degrees of the truck's axis, slower than 0.05
+m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded". A log that is not
+lifted within 12 s, or is lost later, ends it, too. The success is gentle if the crane itself never
+pressed on ground or truck with more than 20 kN, and the log never met the bed faster than 1 m/s. In
+`ground_peak` 1 m/s counts as 20 kN.
 
 Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. On the
-machine joint sensors and a camera that sees both ends of the log give them, as they do Delta_p.
+machine joint sensors and a camera that sees both ends of the log give them, here without noise.
 
 | index | meaning                                                      | unit | low, high   |
 |-------|--------------------------------------------------------------|------|-------------|
@@ -32,7 +33,7 @@ BED, STAKE_TOP, STAKE_Y = 1.2, 2.7, 1.2  # m: above the ground; from the truck's
 BUNK_X = (-6.5, -1.16)  # m, from the last stakes to the headboard
 PLACE_X, STAKE_GAP = -4.1, 1.6  # m: half way between two pairs of stakes; their distance
 LIFT_TIME = 12.0  # s, by which a log must have been lifted; soft drives need more than 9
-SETTLED, HIT = 0.01, 0.05  # m, by which contacts give way: at rest; when a log falls 0.4 m
+SETTLED, HIT = 0.01, 0.05  # m, by which contacts give way at most: at rest; when a log falls
 MAX_ANGLE, MAX_SPEED = np.radians(15), 0.05  # of the log's axis from the truck's; m/s, its ends
 OPEN_Q8 = 1.2  # rad; the tips are 1.29 m apart and let go of 0.8 m
 GENTLE_SPEED, CONTACTS = 1.0, 4  # m/s, of a log that meets the bed, a fall of 5 cm; contacts seen
@@ -45,25 +46,25 @@ HELD_JOINTS = [1.1, 0.05, 0.0], [1.2, 0.15, 0.4]  # q2, q3, q4: tip 4 to 5 m out
 GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
 GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
 
-# ---- the reward; a later stage adds to what all earlier ones pay
+# ---- the reward; a later stage adds to what all earlier ones pay; weights: docs/learned.md
 
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
 LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
 HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
-SWING_WEIGHT = 3.0  # more than that: the way to the bunk takes longer
+SWING_WEIGHT = 3.0  # more than for the height: the way to the bunk takes longer
 SWING_ANGLE = 2.2  # rad from the bunk's azimuth where r_swing is 0; logs start up to 2.1 away
 RADIUS_MISS = 2.5  # m off its radius at which r_swing falls to 1/e
-MIDDLE_WEIGHT, MIDDLE_MISS = 1.5, 0.6  # beside a stake jaws cannot open; m at which it is 1/e
-ALONG_WEIGHT = 2.0  # of it also what lets go of the log depends: later it cannot be turned
+MIDDLE_WEIGHT, MIDDLE_MISS = 1.5, 0.6  # beside a stake jaws cannot open; m off it, at 1/e
+ALONG_WEIGHT = 2.0  # r_lower depends on it, too: a released log cannot be turned
 TOO_HIGH, HIGHEST = 3.6, 8.0  # m, of the lowest point: from here it pays less, from there nothing
 LOWER_WEIGHT = 4.0  # from TOO_HIGH to the bed
-LOW = 0.45  # m above the bed, where jaws may open: opening tips reach 0.24 m below a held log
-MOST_ASKEW = np.radians(30)  # there; with 15 degrees jaws never opened, for a falling log tilts
-LET_GO_WEIGHT = 6.0  # jaws commanded to open there: squeezing policies find no other way to it
-RELEASE_WEIGHT = 4.0  # jaws that open there; from here on all of the above is paid in full
-OFF_WEIGHT = 2.0  # open jaws that touch nothing
-LOADED_PAY = 60 * (LIFTED_PAY + 24.5)  # more than staying: most pay of a step / (1 - gamma)
-GENTLE_BONUS = 0.5  # of r_release and of this; r_ground alone would not outweigh a sooner end
+LOW = 0.45  # m above the bed, where no pay asks for a grip: opening jaws need room below them
+MOST_ASKEW = np.radians(30)  # of a log to let go; with 15 jaws never opened: falling logs tilt
+LET_GO_WEIGHT = 6.0  # for a command to open there: squeezing jaws find no other way
+RELEASE_WEIGHT = 4.0  # for jaws that open there
+OFF_WEIGHT = 2.0  # for open jaws that do not touch the log
+LOADED_PAY = 60 * (LIFTED_PAY + 24.5)  # more than 50 steps of staying: gamma up to 0.98
+GENTLE_BONUS = 0.5  # added share of r_release and r_loaded; r_ground alone is too little
 
 
 def over_bunk(state: CraneState) -> Array:
@@ -83,7 +84,7 @@ def in_bunk(state: CraneState) -> Array:
 
 
 class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
-    """N cranes that load. `info` has bed_speed: m/s, the fastest that the log met the bed."""
+    """N cranes that load. `bed_speed` (N,): m/s, the fastest that the log met the bed."""
 
     REVISION, TIME_LIMIT = 1, 30.0  # s; the scripted crane takes 21 s, on hydraulic drives 25 s
     GOALS = ("loaded",)
@@ -119,29 +120,31 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 
         A share of the cranes and not of the starts: held episodes are long and would be most steps.
         """
+        if self.starts_held[i]:  # it began elsewhere than `starts` says: nothing to repeat
+            self.failures[i].clear(), self.recent_success[i].clear()
         q, log_pose, diameter = super().draw_episode(i)
-        self.starts_held[i] = i < HELD_SHARE * (1 - self.difficulty) * self.num_envs
+        self.starts_held[i] = i + 0.5 < HELD_SHARE * (1 - self.difficulty) * self.num_envs
         if self.starts_held[i]:
             q, (*_, rng) = q.copy(), self.rngs[i]
             q[0], q[1:4] = rng.uniform(-np.pi, q[0]), rng.uniform(*HELD_JOINTS)
             q[4:6] = np.pi / 2 - q[1] - q[2], np.pi / 2
-            q[7] = np.interp(diameter, *GRIP_Q8)
         return q, log_pose, diameter
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
+        self.lifted[ids] = held = self.starts_held[ids]
         super().place(ids, q, log_pose, diameter)
         self.bed_speed[ids] = self.loose[ids] = 0
-        self.lifted[ids] = held = self.starts_held[ids]
         if held.any():
             self.hold(ids[held], diameter[held])
 
     def hold(self, ids: Array, diameter: Array) -> None:
-        """Put the logs into the jaws of cranes `ids`. They sag by 1 cm, on soft drives by 0.2 m."""
+        """Put the logs into the jaws of cranes `ids`. They sag: by 1 cm, on soft drives 0.4 m."""
         (x, y, z), (axis_x, axis_y) = self.sensordata[ids, :3].T, self.sensordata[ids, 3:5].T
         z += GRIP_TOP - diameter / 2
         yaw = np.arctan2(-axis_x, axis_y)
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
         self.batch.joint("log").qpos[ids] = np.stack([x, y, z, cos, -cos, -sin, sin], axis=-1)
+        self.qpos[ids, 8:10] = np.interp(diameter, *GRIP_Q8)[:, None]  # both jaws
         self.batch.forward(ids, stage=crane_env.VEL)
         squeeze = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
         self.act[ids, 6:] = self.qpos[ids, 8:10] + squeeze
@@ -169,14 +172,11 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         place = [cos * x + sin * y, cos * y - sin * x, z]
         return np.column_stack([super().observe(state), *place, angle, tilt])
 
-    def measure(self, state: CraneState) -> dict[str, Array]:
-        return super().measure(state) | {"bed_speed": self.bed_speed.copy()}
-
     def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """Terms of lifting but r_balance, which pays for standing still. Then the stages above."""
         height = np.minimum(info["clearance"], crane_env.DESIRED_HEIGHT)  # higher pays no less
         terms = super().reward_terms(state, info | {"clearance": height})
-        terms.pop("r_balance", None)
+        terms.pop("r_balance", None)  # the printed reward has none
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         over = over_bunk(state) & (lowest >= BED - HIT)
         askew = np.arccos(np.minimum(np.abs(state.log_axis[:, 0]), 1))  # rad, turned or tilted
@@ -195,8 +195,8 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         off = (opened == 1) & (self.on_log == 0)
         lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
         gentle = 1 + GENTLE_BONUS * (self.ground_peak <= GENTLE_FORCE)
-        holds = self.conditions(state, info)
-        loaded = [ok & (self.streaks.get(k, 0) >= self.hold_steps - 1) for k, ok in holds.items()]
+        holds, last = self.conditions(state, info), self.hold_steps - 1
+        loaded = [ok & (self.streaks.get(name, 0) >= last) for name, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
             terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
         return terms | {
@@ -211,7 +211,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         }
 
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """not_lifted: LIFT_TIME is over. log_lost: a lifted log, not in the bunk, is let go."""
+        """not_lifted: LIFT_TIME is over. log_lost: a lifted log is let go beside the bunk."""
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
         self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
