@@ -89,7 +89,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
     REVISION, TIME_LIMIT = 1, 30.0  # s; the scripted crane takes 21 s, on hydraulic drives 25 s
     GOALS = ("loaded",)
     GROUND_WEIGHT = 3.0  # less than for lifting: opening jaws may touch the bed
-    SCRIPTED = "scripted_loading:ScriptedLoadingCrane"  # what eval_crane.py runs as `scripted`
+    SCRIPTED = "crane_utils.scripted_loading:ScriptedLoadingCrane"  # of eval_crane.py
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         self.bed_speed = np.zeros(num_envs)  # m/s

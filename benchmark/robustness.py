@@ -31,10 +31,10 @@ from benchmark.runs import LABELS, LEVELS, LOADING, METRICS, RESULTS, ROOT, read
 from crane_env import ACTION_OF_SERVO, SERVOS
 from crane_utils import runs
 from crane_utils import trials as protocol
+from crane_utils.scripted_loading import ScriptedLoadingCrane
 from crane_utils.trials import REPORT_SEED
 from hydraulic_crane import PUMP_FLOW, HydraulicCraneVectorEnv, oil_per_movement
 from scripted_crane import ScriptedCrane
-from scripted_loading import ScriptedLoadingCrane
 
 METHODS = {label: script for script, label in LABELS.items()} | {"scripted": "scripted"}
 CHANGES = {  # attribute of ChangedCranes: what the tables call it, and its values

@@ -7,9 +7,9 @@ from gymnasium.utils.env_checker import check_env
 
 import loading_crane
 from crane_env import GENTLE_FORCE, CraneState, CraneVectorEnv
+from crane_utils.scripted_loading import ScriptedLoadingCrane
 from crane_utils.trials import make_envs, monte_carlo_trials, run_trials
 from loading_crane import HydraulicLoadingCraneVectorEnv, LoadingCraneVectorEnv
-from scripted_loading import ScriptedLoadingCrane
 
 IDLE = np.zeros((1, 6))
 

@@ -1,4 +1,4 @@
-"""The scripted crane of the loading cycle: scripted_crane.py, with more phases after LIFT.
+"""The scripted crane of the loading cycle: scripted_crane.py with more phases after LIFT.
 
 LIFT raises the log and turns it along the truck. SWING goes on over the stakes, round the slew axis
 at the bunk's radius. LOWER ends where the log or the jaws are just above the bed. In OPEN the crane
