@@ -148,7 +148,6 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         self.batch.forward(ids, stage=crane_env.VEL)
         squeeze = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
         self.act[ids, 6:] = self.qpos[ids, 8:10] + squeeze
-        self.reach_time[ids] = 0
 
     # ---- what is observed, measured and rewarded, and what ends an episode
 

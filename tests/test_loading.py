@@ -83,6 +83,15 @@ def test_a_released_log_is_loaded_and_gentle_if_it_did_not_fall(height, gentle):
     assert info["r_loaded"] == loading_crane.LOADED_PAY * (1 + bonus) and 0.5 < info["time"] < 1.5
 
 
+def test_a_log_in_the_middle_of_the_bunk_pays_more_than_one_beside_a_stake():
+    envs, pay = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False), []
+    for aside in (0.0, 0.6):  # MIDDLE_MISS
+        put(envs, -4.1, aside, 1.4)
+        pay.append(envs.step(IDLE)[-1]["r_middle"][0])
+    assert pay[0] == pytest.approx(loading_crane.MIDDLE_WEIGHT, rel=0.01)
+    assert pay[1] == pytest.approx(pay[0] / np.e, rel=0.02)
+
+
 def test_force_on_the_truck_counts():
     """Jaws that are driven onto the bed; a crane that rests on the ground is felt as before."""
     envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
