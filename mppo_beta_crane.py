@@ -60,7 +60,7 @@ class Args:
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     threads: Count = 2  # CPU threads of physics and updates
     eval_every: Count = 25  # updates between evaluations
-    eval_trials: Count = 20  # trials per log diameter in each evaluation
+    eval_trials: Count = 10  # trials per log diameter in each evaluation
     final_trials: Count = 100  # the same after the last update
     resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 

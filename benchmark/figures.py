@@ -20,8 +20,8 @@ from tqdm import tqdm
 from tyro.conf import Positional
 
 import eval_crane
-from benchmark import runs
-from benchmark.runs import LABELS, RESULTS, ROOT, Curve, read_curves, read_rows
+from benchmark import runs, tables
+from benchmark.runs import LABELS, LEVELS, RESULTS, ROOT, Curve, read_curves, read_rows
 from crane_utils import trials
 from crane_utils.world import decorate
 from hydraulic_crane import HydraulicCraneVectorEnv
@@ -58,13 +58,16 @@ def draw(axis: plt.Axes, seeds: list[Curve], x: str, y: str, scale: float, **sty
     steps = [*[at for at in seeds[0]["steps"] if at < end], end]
     ys = np.array([np.interp(steps, run["steps"], run[y]) for run in seeds])
     xs = scale * np.mean([np.interp(steps, run["steps"], run[x]) for run in seeds], axis=0)
+    if y.endswith("_rate"):  # untrained policies hardly move: `eval_crane.py zero` lifts nothing
+        xs, ys = np.append(0, xs), np.insert(ys, 0, 0, axis=1)
     axis.plot(xs, ys.mean(0), **style)
     axis.fill_between(xs, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
 
 
-def four_panels(columns: dict[str, tuple], rows: dict[str, str], path: Path) -> None:
+def panels(columns: dict[str, tuple], rows: dict[str, str], path: Path) -> None:
     """columns: what stands below them: runs by label, x and its scale; rows: y by its name."""
-    figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), sharex="col", sharey="row")
+    size = {"figsize": (5 * len(columns), 6.4)}
+    figure, axes = plt.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False, **size)
     for column, (below, (lines, x, scale)) in enumerate(columns.items()):
         for row, (name, y) in enumerate(rows.items()):
             axis = axes[row, column]
@@ -74,13 +77,8 @@ def four_panels(columns: dict[str, tuple], rows: dict[str, str], path: Path) -> 
             axis.grid(alpha=0.3)
             axes[row, 0].set_ylabel(f"{name} of the mean action")
         axis.set_xlabel(below)
-    axes[0, 0].legend(fontsize=8)
+        axes[0, column].legend(fontsize=8)
     save(figure, path)
-
-
-def learning_curves(lines: dict[str, list[Curve]], path: Path) -> None:
-    columns = {"steps [million]": (lines, "steps", 1e-6), "minutes": (lines, "minutes", 1)}
-    four_panels(columns, {"success": "eval_success_rate", "return": "eval_episodic_return"}, path)
 
 
 def run(paths: Positional[tuple[Path, ...]], figure: Path = Path("curves.svg")) -> None:
@@ -101,19 +99,47 @@ def run(paths: Positional[tuple[Path, ...]], figure: Path = Path("curves.svg")) 
         lines.setdefault(label, []).append(runs.curve(rows))
         if not len(lines[label][-1]["steps"]):
             raise SystemExit(f"{path} has no evaluation on the crane yet (--eval-every)")
-    learning_curves(lines, figure)
+    columns = {"steps [million]": (lines, "steps", 1e-6), "minutes": (lines, "minutes", 1)}
+    rows = {"success": "eval_success_rate", "return": "eval_episodic_return"}
+    panels(columns, rows, figure)
 
 
 def curves() -> None:
-    """Draw learning_curves.svg and level_curves.svg: results/curves/ and results/levels/."""
-    found, columns = read_curves("curves") | read_curves("levels"), {}
-    for level in ("", "_hydraulic", "_randomized"):
-        lines = {label: found.get(script + level) for script, label in LABELS.items()}
-        lines = {label: [*of_seed.values()] for label, of_seed in lines.items() if of_seed}
-        columns[f"steps [million], {level[1:]} level"] = (lines, "steps", 1e-6)
-    learning_curves(columns.pop("steps [million],  level")[0], FIGURES / "learning_curves.svg")
+    """Draw learning_curves.svg, results/curves/ and results/levels/, and loading_curves.svg."""
     rows = {"success": "eval_success_rate", "gentle success": "eval_gentle_rate"}
-    four_panels(columns, rows, FIGURES / "level_curves.svg")
+    found, columns = read_curves("curves") | read_curves("levels"), {}
+    for level in LEVELS:
+        names = {f"{script}_{level}".removesuffix("_ideal"): LABELS[script] for script in LABELS}
+        lines = {label: [*found[name].values()] for name, label in names.items() if name in found}
+        columns[f"steps [million], {level} level"] = (lines, "steps", 1e-6)
+    panels(columns, rows, FIGURES / "learning_curves.svg")
+    lines = {}
+    for name, of_seed in read_curves("loading").items():
+        script, level = name.rsplit("_", 1)
+        lines[f"{LABELS[script]}, {level}"] = [*of_seed.values()]
+    columns = {"steps [million], loading cycle": (lines, "steps", 1e-6)}
+    panels(columns, rows, FIGURES / "loading_curves.svg")
+
+
+def levels() -> None:
+    """Draw levels.svg: success of the algorithms on the levels, a dot for each seed."""
+    figure, axes = plt.subplots(1, len(LEVELS), figsize=(12, 3.4), sharey=True)
+    board = [row for row in read_rows(RESULTS / "leaderboard.csv") if row["method"] == "scripted"]
+    for axis, level in zip(axes, LEVELS):
+        columns = {label: tables.evaluations(script, level) for script, label in LABELS.items()}
+        of = {label: tables.numbers(rows, "success") for label, rows in columns.items()}
+        of["scripted"] = [float(row["success_exact"]) for row in board if row["level"] == level]
+        for x, success in enumerate(of.values()):
+            axis.plot([x] * len(success), success, "o", color=f"C{x}", alpha=0.7)
+            axis.hlines(np.mean(success), x - 0.3, x + 0.3, color=f"C{x}", linewidth=2)
+        axis.set_xticks(range(len(of)), [label.replace(" ", "\n") for label in of])
+        axis.set_title(f"{level} level")
+        axis.grid(axis="y", alpha=0.3)
+    label = "paper, Table I: another rule, 500 M steps"
+    axes[0].axhline(PAPER, color="black", linestyle="--", linewidth=1, label=label)
+    axes[0].legend(fontsize=8, loc="lower left")
+    axes[0].set_ylabel("success [%], a dot per training seed")
+    save(figure, FIGURES / "levels.svg")
 
 
 def ablations() -> None:
@@ -135,23 +161,25 @@ def ablations() -> None:
 
 
 def robustness() -> None:
-    """Draw robustness.svg: results/robustness.csv, a panel for each change."""
+    """Draw robustness.svg: results/robustness.csv, a panel for each change, 95 % intervals."""
     lines: dict[str, dict[str, list]] = {}
     for row in read_rows(RESULTS / "robustness.csv"):
-        point = float(row["value"]), float(row["success"])
+        trials, share = int(row["trials"]), float(row["success"]) / 100
+        low, high = eval_crane.wilson_interval(round(share * trials), trials)
+        point = [float(row["value"]), 100 * share, 100 * low, 100 * high]
         lines.setdefault(row["changed"], {}).setdefault(row["method"], []).append(point)
-    rows = -(-len(lines) // 4)
-    figure = plt.figure(figsize=(12, 3 * rows))
-    for k, (change, of_method) in enumerate(lines.items()):
-        axis = figure.add_subplot(rows, 4, k + 1, xlabel=change, ylim=(0, 102))
-        axis.set_ylabel("" if k % 4 else "success [%]")
-        for method, points in of_method.items():
-            axis.plot(*zip(*sorted(points)), "o-", markersize=4, label=method)
+    figure, axes = plt.subplots(-(-len(lines) // 3), 3, figsize=(12, 8), sharey=True)
+    for axis, (change, of_method) in zip(axes.flat, lines.items()):
+        for k, (method, points) in enumerate(of_method.items()):
+            x, success, low, high = np.array(sorted(points)).T
+            axis.plot(x, success, "o-", color=f"C{k}", label=method)
+            axis.fill_between(x, low, high, color=f"C{k}", alpha=0.15)
+        axis.set_xlabel(change, fontsize=11)
         axis.grid(alpha=0.3)
-        axis.set_xscale("log" if change.startswith("passive") else "linear")
-    handles = axis.get_legend_handles_labels()
-    figure.legend(*handles, loc="upper center", bbox_to_anchor=(0.5, 0.03), ncols=6)
-    figure.subplots_adjust(hspace=0.3)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("success [%]", fontsize=11)
+    axes[0, 0].legend()
+    figure.tight_layout()
     save(figure, FIGURES / "robustness.svg")
 
 
@@ -206,39 +234,76 @@ def drives() -> None:
     save(figure, FIGURES / "drives.svg")
 
 
-def pictures(policy: str, diameter: float) -> list[Image.Image]:
-    """A labelled picture after each step of a trial of seed 60000."""
+def pictures(
+    policy: str, diameter: float, trial: int = 0, every: int = 1, label: str = "",
+    size: tuple[int, int] = (400, 300), camera: str = "overview",
+) -> list[Image.Image]:  # fmt: skip
+    """Labelled pictures of a trial of seed 60000, one in `every` steps and the last."""
     agent, task, _ = eval_crane.load_policy(policy)
-    look = {"render_mode": "rgb_array", "width": 400, "height": 300, "decorate": decorate}
-    how = task["options"] | look | {"diameter": diameter, "autoreset": False}
-    crane = trials.make_envs(task["env_id"], 1, 1, how).unwrapped
-    seed = trials.monte_carlo_trials(trials.REPORT_SEED, 2, [diameter])[1][1]
-    obs, state, taken = crane.reset(seed=[seed])[0], None, []
-    for step in tqdm(range(crane.max_steps + 1), unit="picture"):
-        taken.append(Image.fromarray(crane.render()[0]))
-        pen, label = ImageDraw.Draw(taken[-1], "RGBA"), f"{diameter} m, {step * crane.dt:.1f} s"
-        pen.rectangle((0, 0, 400, 22), fill=(0, 0, 0, 120))
-        pen.text((6, 3), label, font=ImageFont.load_default(14), fill="white")
+    look = {"render_mode": "rgb_array", "camera": camera, "decorate": decorate}
+    look |= {"width": size[0], "height": size[1], "diameter": diameter, "autoreset": False}
+    crane = trials.make_envs(task["env_id"], 1, 1, task["options"], **look).unwrapped
+    seeds = trials.monte_carlo_trials(trials.REPORT_SEED, trial + 1, [diameter])[1]
+    obs, state, taken, end = crane.reset(seed=seeds[-1:])[0], None, [], False
+    for step in tqdm(range(crane.max_steps + 1), unit="step", leave=False):
+        if end or step % every == 0:
+            taken.append(Image.fromarray(crane.render()[0]))
+            pen, text = ImageDraw.Draw(taken[-1], "RGBA"), f"{diameter} m, {step * crane.dt:.1f} s"
+            pen.rectangle((0, 0, size[0], 22), fill=(0, 0, 0, 120))
+            font = ImageFont.load_default(14)
+            pen.text((6, 3), f"{text}{label}", font=font, fill="white")
+        if end:
+            break
         actions, state = agent.predict(obs, state)
-        obs = crane.step(actions)[0]
+        obs, _, terminated, truncated, _ = crane.step(actions)
+        end = bool(terminated[0] | truncated[0])
     crane.close()
     return taken
 
 
-def hero(policy: Positional[str] = eval_crane.SHIPPED) -> None:
-    """Make lift.gif, in minutes without a GPU. policy: a run's folder or policy.pt."""
-    pairs = zip(pictures(policy, 0.3), pictures(policy, 0.8))
-    film = [Image.fromarray(np.concatenate([*map(np.asarray, pair)], axis=1)) for pair in pairs]
+def sheet(taken: list[Image.Image], columns: int, path: Path) -> None:
+    """Write pictures side by side, `columns` in a row."""
+    width, height = taken[0].size
+    whole = Image.new("RGB", (columns * width, -(-len(taken) // columns) * height), "white")
+    for k, picture in enumerate(taken):
+        whole.paste(picture, (k % columns * width, k // columns * height))
+    whole.save(path, quality=85)
+    print(f"written to {path}")
+
+
+def grasp(policy: Positional[str] = eval_crane.SHIPPED, diameter: float = 0.5) -> None:
+    """Make grasp.jpg: one trial, a picture each 0.7 s."""
+    taken = pictures(policy, diameter, every=7)
+    sheet(taken[:12], 4, FIGURES / "grasp.jpg")
+
+
+def failures(policy: Positional[str] = eval_crane.SHIPPED, most: int = 8) -> None:
+    """Make failures.jpg: the ends of failed trials of seed 60000, with their causes."""
+    agent, task, _ = eval_crane.load_policy(policy)
+    options = trials.crane_class(task["env_id"]).Options(**task["options"])
+    args = eval_crane.Args(seed=trials.REPORT_SEED)
+    rows = [*eval_crane.play(agent, task["env_id"], options, args)]
+    rows = [row for row in rows if not row["success"]]
+    taken = []
+    for row in rows[:: -(-len(rows) // most)]:
+        label = f", {row['failure'].replace('_', ' ')}"
+        taken += pictures(policy, row["diameter"], row["trial"], 1000, label)[-1:]
+    sheet(taken, 4, FIGURES / "failures.jpg")
+
+
+def hero(policy: Positional[str], diameter: float = 0.6, trial: int = 0) -> None:
+    """Make loading.gif, the loading cycle at double speed. policy: a run's folder or policy.pt."""
+    film = pictures(policy, diameter, trial, 2, size=(800, 450))
     # One palette and no dithering: where nothing moves no pixel changes, and GIF stores nothing.
-    palette = film[len(film) // 2].quantize(160)
+    palette = film[len(film) // 2].quantize(128)
     film = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in film]
     how = {"save_all": True, "append_images": film[1:], "duration": 100, "loop": 0}
-    film[0].save(FIGURES / "lift.gif", **how)
-    print(f"written to {FIGURES / 'lift.gif'}")
+    film[0].save(FIGURES / "loading.gif", **how)
+    print(f"written to {FIGURES / 'loading.gif'}")
 
 
 if __name__ == "__main__":
-    commands = (run, curves, ablations, robustness, drives, hero)
+    commands = (run, curves, levels, ablations, robustness, drives, grasp, failures, hero)
     tyro.extras.subcommand_cli_from_dict(
         {command.__name__: command for command in commands}, description=__doc__
     )
