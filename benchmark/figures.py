@@ -30,12 +30,6 @@ matplotlib.use("Agg")
 matplotlib.rcParams["svg.hashsalt"] = "curves"  # the same curves give the same file
 FIGURES = ROOT / "assets" / "figures"
 PAPER = np.mean([*eval_crane.PAPER["none"].values()])  # % of mPPO, Table I
-ABLATIONS = {name: label for name, (label, *_) in runs.ABLATIONS.items()} | {
-    # with earlier settings, without r_ground and with other drives (commit fd1bad9)
-    "perturb_rpo": "mean perturbed instead (RPO) *",
-    "no_bootstrap": "no bootstrapping at the time limit *",
-    "curriculum": "difficulty rises with success *",
-}
 INSTANTS = np.array([0.06, 0.10, 0.15, 0.20, 0.30, 0.45, 0.60, 0.90, 1.20])  # s
 AXES = {  # speed / command that the machine had at INSTANTS; inertia; q2, q3, q4, q8, in the air
     "slew": ([0.01, 0.02, 0.13, 0.33, 0.87, 1.42, 1.33, 0.75, 1.04], 4251, (1.2, -0.5, 0.0, 0.3)),
@@ -145,7 +139,7 @@ def levels() -> None:
 def ablations() -> None:
     """Draw ablations.svg: results/ablations/, a line for each change, a dot for each seed."""
     found = read_curves("ablations")
-    shown = {label: found[name] for name, label in ABLATIONS.items() if name in found}
+    shown = {label: found[name] for name, (label, *_) in runs.ABLATIONS.items() if name in found}
     figure, axis = plt.subplots(figsize=(8, 0.36 * len(shown) + 1))
     for row, seeds in enumerate(reversed(shown.values())):
         for k, of_seed in enumerate(seeds.values()):

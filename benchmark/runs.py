@@ -97,7 +97,7 @@ ABLATIONS = {  # what it is in the figure, script and flags
                      "--gae-lambda 0.98979 --reward-scale 0.012"),
 }  # fmt: skip
 SHORT, EXACT = "--total-timesteps 614400 --eval-every 10 ", " --eval-trials 100"
-FIVE, THREE, TWO = range(21, 26), range(21, 24), range(21, 23)
+FIVE, THREE = range(21, 26), range(21, 24)
 TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
     *[("levels", f"{script}_{level}", script, flags, FIVE if level == "hydraulic" else THREE)
@@ -106,7 +106,7 @@ TRAININGS = [  # folder, name, script, flags, seeds
     ("short", MPPO, MPPO, "--total-timesteps 512000 --eval-every 8", THREE),
     ("timed", MPPO, MPPO, EXACT, [21]),
     *[("timed", f"{MPPO}_{level}", MPPO, HARD[level][MPPO] + EXACT, [21]) for level in HARD],
-    *[("ablations", name, script, SHORT + flags, TWO)
+    *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],
 ]  # fmt: skip
 QUICK = "--total-timesteps 768 --num-envs 8 --num-steps 32 --eval-every 2 --eval-trials 1 "
@@ -201,6 +201,7 @@ def evaluate(policy: str, noise: str, *flags: str) -> dict[str, float]:
     whole = lines.pop("all")
     row = {diameter: round(line["success %"], 1) for diameter, line in lines.items()}
     row |= {name: round(whole[f"{name} %"], 2) for name in ("success", "gentle")}
+    row["failures"] = whole["failures"]
     return row | {name: whole[name] and float(f"{whole[name]:.4g}") for name in METRICS}
 
 

@@ -12,7 +12,7 @@ differs by more than a percentage point.
 
 import re
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from itertools import product
 from pathlib import Path
@@ -88,6 +88,21 @@ def seeds() -> str:
             lines.append(line + [joined(numbers(rows, name), 1, "-") for name in metrics])
     header = ["level", "method", "steps [million]", "seeds", "success", "mean", "gentle", "mean"]
     return table([*header, "energy [kJ]", "up [s]"], lines)
+
+
+def causes() -> str:
+    """evaluations.csv: what failed trials are counted under, sums of the training seeds."""
+    counts: dict[tuple[str, str], Counter] = defaultdict(Counter)
+    for level, (script, method) in product(LEVELS, LABELS.items()):
+        for row in evaluations(script, level):
+            for cause in filter(None, row.get("failures", "").split(", ")):
+                name, number = cause.split(" ")
+                counts[level, method][name] += int(number)
+            counts[level, method]["trials"] += 600
+    names = [name for name, _ in sum(counts.values(), Counter()).most_common() if name != "trials"]
+    heads = ["trials", *names]
+    lines = [[*key, *(str(of[name] or "") for name in heads)] for key, of in counts.items()]
+    return table(["level", "method", *(f"`{name}`" for name in heads)], lines)
 
 
 def loading() -> str:
@@ -200,7 +215,7 @@ def held() -> str:
     return table(["policy", *LEVELS], lines)
 
 
-ALL = (results, seeds, loading, learning, paper, costs, held, timed, speed, leaderboard)
+ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, speed, leaderboard)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 
