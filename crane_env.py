@@ -40,8 +40,7 @@ that direction. 0 stops the joint. Values outside the box are clipped.
 | 5     | q8 jaws, + closes      | -1, 1     | -1.8, 1.8 rad/s       |
 
 A task of your own is a subclass of `CraneVectorEnv` that overrides some of its hooks. They stand in
-the order in which a step calls them. hydraulic_crane.py is such a task, docs/tutorial.md shows
-smaller ones.
+the order in which a step calls them. Examples: loading_crane.py, docs/tutorial.md.
 """
 
 import os
@@ -78,7 +77,6 @@ PIVOT_HEIGHT = 0.5  # m, from p_C up to the pivots
 Q8_MAX = 3.0  # rad
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 # The engine's joints, before the seven numbers of the log's pose, and our lists of them:
-#
 #             index:  0   1   2   3   4          5   6   7   8   9
 #             joint:  q1  q2  q3  q4  q4_stage2  q5  q6  q7  q8  q8_inner
 JOINTS = [0, 1, 2, 3, 5, 6, 7, 8]  # our q1 ... q8
@@ -435,20 +433,20 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info = self.measure(state) | {"time": time, "diverged": diverged}
         reached = self.reached(info) & (time < self.REACH_TIME + 1e-9)
         self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
-        info["time_to_reach"] = self.reach_time.copy()
-        terms = self.reward_terms(state, info)
+        terms = self.of_each(self.reward_terms(state, info))
         terms = {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
-        info |= terms
+        info |= terms | {"time_to_reach": self.reach_time.copy()}
         reward = sum(terms.values())
 
         # success: each condition held at every step of the last HOLD_TIME
-        holds = self.conditions(state, info)
+        holds = self.of_each(self.conditions(state, info))
         self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
         held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
         info["safe"] = np.all([*held.values()], axis=0)
 
         # rules
-        rules = self.rules(state, info) | {"time_limit": time > self.TIME_LIMIT - 1e-9}
+        rules = self.of_each(self.rules(state, info))
+        rules |= {"time_limit": time > self.TIME_LIMIT - 1e-9}
         ending = np.select([*rules.values()], [*rules], default="none")
         done, truncated = ending != "none", ending == "time_limit"
         terminated = done & ~truncated
@@ -478,6 +476,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if self.render_mode == "human":
             self.render()
         return obs, reward, terminated, truncated, info
+
+    def of_each(self, values: dict[str, Array]) -> dict[str, Array]:
+        """What a hook returned. ValueError names a value that NumPy would silently repeat."""
+        for name, value in values.items():
+            if np.shape(value) != self.steps.shape:
+                raise ValueError(f"{name} must be {self.steps.shape}, not {np.shape(value)}")
+        return values
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
         """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
@@ -529,8 +534,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def draw_episode(self, i: int) -> tuple[Array, Array, float]:
         """Draw crane i's next start, as `sample_start` gives it, and its pose errors."""
-        if not 0 <= self.difficulty <= 1:
-            raise ValueError(f"difficulty must be in [0, 1], got {self.difficulty}")
         (start_rng, noise_rng, _), failures = self.rngs[i], self.failures[i]
         share = self.retry * np.mean(self.recent_success[i] or 0.0)  # 0 at first
         if share and failures and start_rng.random() < share:
@@ -564,10 +567,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             streak[ids] = 0
 
     def set_constants(self, ids: Array, radius: Array) -> None:
-        """Write to the engine what differs between episodes: the log of radius (n,), in m.
-
-        Poses of your own bodies belong here, too: positions are computed after it.
-        """
+        """Write to the engine what differs between episodes: radius (n,) in m, your own bodies."""
         mass = self.density[ids] * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
         log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
@@ -629,13 +629,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         weight = np.linalg.norm(self.model.opt.gravity) * self.batch.body("log").mass[:, 0]
         ground = np.linalg.norm(support, axis=-1) + np.linalg.norm(pressure, axis=-1)
         carried = np.clip(1 - ground / weight, 0, 1)
-        diameter = 2 * self.batch.geom("log").size[:, 0]
-        return CraneState(q, dq, *poses, touch > 0, diameter, carried)
+        return CraneState(q, dq, *poses, touch > 0, 2 * self.batch.geom("log").size[:, 0], carried)
 
     def bounded_observation(self, state: CraneState, diverged: Array | bool = False) -> Array:
         """`observe` as float32 (N, n) within the space, from 0 where a crane diverged."""
-        space = self.single_observation_space
-        obs = np.where(np.reshape(diverged, (-1, 1)), 0.0, self.observe(state))
+        space, obs = self.observation_space, self.observe(state)
+        if obs.shape != space.shape:
+            raise ValueError(f"observe gives {obs.shape}, observation_limits {space.shape}")
+        obs = np.where(np.reshape(diverged, (-1, 1)), 0.0, obs)
         return np.clip(obs, space.low, space.high).astype(np.float32, order="C")
 
     def observation_limits(self) -> Array:

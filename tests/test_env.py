@@ -388,7 +388,6 @@ def test_coarser_physics_is_the_same_task(skip, physics_step, steps):
 
 WRONG = [
     ({"diameter": 0.29}, r"diameter must be in \[0.3, 0.8\] m, got"),
-    ({"difficulty": 1.5}, r"difficulty must be in \[0, 1\], got 1.5"),
     ({"frame_skip": 0}, "frame_skip\n.*greater than or equal to 1"),
     ({"contact": "soft"}, "contact\n.*'primitive' or 'sdf'"),
     ({"signed_yaw": 1}, "signed_yaw\n.*boolean"),
@@ -401,6 +400,23 @@ WRONG = [
 def test_wrong_arguments(options, words):
     with pytest.raises(ValueError, match=words):
         CraneVectorEnv(2, **options).reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    "hook, answer, words",
+    [
+        ("observe", np.zeros((2, 1)), "observe gives (2, 1), observation_limits (2, 18)"),
+        ("reward_terms", {"r_wind": 0.5}, "r_wind must be (2,), not ()"),
+        ("rules", {"fell": np.array([True])}, "fell must be (2,), not (1,)"),
+        ("conditions", {"late": True}, "late must be (2,), not ()"),
+    ],
+)
+def test_a_hook_that_does_not_answer_for_each_crane(hook, answer, words, monkeypatch):
+    envs = CraneVectorEnv(2)
+    envs.reset(seed=0)
+    monkeypatch.setattr(envs, hook, lambda *_: answer)
+    with pytest.raises(ValueError, match=re.escape(words)):
+        envs.step(np.zeros((2, 6)))
 
 
 def test_wrong_calls():
