@@ -692,6 +692,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """closed and grip of `staged_terms`."""
         return state.q[:, 7] / Q8_MAX, centred(miss)
 
+    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """What must hold throughout the last HOLD_TIME, (N,) bool each, named by its failure."""
+        return {
+            "not_lifted": info["clearance"] >= MIN_CLEARANCE,
+            "not_held": state.touching.all(axis=-1),
+            "off_centre": info["centre_miss"] <= MAX_MISS,
+        }
+
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """What ends an episode early (Sec. IV-B3), (N,) bool each, by name. The first counts."""
         q, (low, high) = state.q, self.joint_range.T
@@ -705,14 +713,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "overspeed": (np.abs(state.dq) > 2 * speed_limit(state.dq)).any(axis=-1),
             "log_too_far": away > LOG_RANGE,
             "not_reached": too_late & np.isinf(self.reach_time),
-        }
-
-    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """What must hold throughout the last HOLD_TIME, (N,) bool each, named by its failure."""
-        return {
-            "not_lifted": info["clearance"] >= MIN_CLEARANCE,
-            "not_held": state.touching.all(axis=-1),
-            "off_centre": info["centre_miss"] <= MAX_MISS,
         }
 
     # ---- pictures

@@ -116,8 +116,8 @@ BUILT_IN = {
 LEGEND = """\
 Gentle: success with at most 20 kN of the crane on the ground. Peak: median of all trials. Other
 averages are of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
-centre), medians of the others. Up: when success was safe. The paper's rule is weaker, and it
-trained for 500 million physics steps."""
+centre), medians of the others. Up: when success was safe."""
+PAPERS = " The paper's rule is weaker, and it trained for 500 million physics steps."
 
 
 def load_policy(name: str, env_id: str | None = None) -> tuple[Any, dict[str, Any], str]:
@@ -126,7 +126,7 @@ def load_policy(name: str, env_id: str | None = None) -> tuple[Any, dict[str, An
         name = getattr(trials.crane_class(env_id), "SCRIPTED", name)
     if name in BUILT_IN or (":" in name and not Path(name).exists()):
         module, _, attribute = BUILT_IN.get(name, name).partition(":")
-        made = getattr(importlib.import_module(module), attribute, None)
+        made = getattr(importlib.import_module(module), attribute)
         if not hasattr(made, "predict"):
             raise SystemExit(f"{name} must be a class with predict (docs/compare.md)")
         policy = made()
@@ -139,7 +139,7 @@ def task_of(policy: Any, trained: dict, args: Args, flags: list[str]) -> tuple[s
     env_id = args.env_id or trained.get("env_id", "ForestryCrane-v0")
     cranes = trials.crane_class(env_id)
     if cranes is None:
-        raise SystemExit(f"{env_id} is not the crane; name a task of CraneVectorEnv or a subclass")
+        raise SystemExit(f"{env_id} is not the crane: its vector_entry_point is no CraneVectorEnv")
     default = trials.task_options(env_id)
     if "options" in trained and not args.env_id:
         default = cranes.Options(**trained["options"])
@@ -201,7 +201,7 @@ def summarize(rows: list[dict], published: dict[float, float]) -> dict[str, Any]
     paper = [published.get(d) for d in sorted({row["diameter"] for row in rows})]
     line = {
         "trials": n,
-        "paper %": "" if None in paper else round(float(np.mean(paper)), 1),
+        **({} if None in paper else {"paper %": round(float(np.mean(paper)), 1)}),
         "success %": 100 * len(wins) / n,
         "95 % interval": f"{100 * low:.1f}-{100 * high:.1f}",
         "gentle %": 100 * sum(row["gentle"] for row in rows) / n,
@@ -215,8 +215,9 @@ def summarize(rows: list[dict], published: dict[float, float]) -> dict[str, Any]
 
 def print_table(lines: dict[str, dict]) -> None:
     """A Markdown table of named lines."""
-    heads = ["", *next(iter(lines.values()))]
-    cells = [[name, *line.values()] for name, line in lines.items()]
+    heads = [*dict.fromkeys(head for line in lines.values() for head in line)]
+    cells = [[name, *(line.get(head, "") for head in heads)] for name, line in lines.items()]
+    heads = ["", *heads]
     cells = [[f"{c:.4g}" if isinstance(c, float) else str(c) for c in row] for row in cells]
     widths = [max(map(len, column)) for column in zip(heads, *cells)]
     for row in [heads, ["-" * w for w in widths], *cells]:
@@ -285,7 +286,7 @@ def main() -> None:
         print(f"\n{label} ({name}) on {', '.join([env_id, *changed])}, seed {args.seed}")
         print_table(table)
     if overall and not args.json:
-        print(LEGEND)
+        print(LEGEND + PAPERS * any("paper %" in line for line in overall.values()))
         if len(overall) > 1:
             print()
             print_table(overall)

@@ -209,6 +209,16 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
             "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * gentle,
         }
 
+    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
+        speed += LOG_LENGTH / 2 * np.linalg.norm(self.qvel[:, LOG_TURNING], axis=-1)
+        return {
+            "not_in_bunk": in_bunk(state),
+            "not_along": np.abs(state.log_axis[:, 0]) >= np.cos(MAX_ANGLE),
+            "moving": speed < MAX_SPEED,
+            "not_released": (self.on_log == 0) & (state.q[:, 7] <= OPEN_Q8),
+        }
+
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """not_lifted: LIFT_TIME is over. log_lost: a lifted log is let go beside the bunk."""
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
@@ -219,16 +229,6 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}
         self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)
         return super().rules(state, info) | ends | {"loaded": info["safe"]}
-
-    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
-        speed += LOG_LENGTH / 2 * np.linalg.norm(self.qvel[:, LOG_TURNING], axis=-1)
-        return {
-            "not_in_bunk": in_bunk(state),
-            "not_along": np.abs(state.log_axis[:, 0]) >= np.cos(MAX_ANGLE),
-            "moving": speed < MAX_SPEED,
-            "not_released": (self.on_log == 0) & (state.q[:, 7] <= OPEN_Q8),
-        }
 
 
 class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):

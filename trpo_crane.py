@@ -168,7 +168,7 @@ def fisher_vector_product(agent: Agent, obs: Tensor, damping: float) -> Callable
     sigma. Second derivatives of mu drop out because d KL / d mu is 0 at the old policy.
     """
     mean, weights = agent.actor(obs), list(agent.actor.parameters())
-    u = torch.zeros_like(mean, requires_grad=True)  # J^T u is linear in u: any value does
+    u = torch.zeros_like(mean, requires_grad=True)  # only to differentiate: J^T u is linear in u
     jt_u = flat(torch.autograd.grad(mean, weights, u, create_graph=True))
 
     def product(v: Tensor) -> Tensor:

@@ -197,5 +197,5 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
         raise SystemExit(f"{path}: {', '.join(wrong[:3])} not finite")
     bounds = weights["action_low"].numpy(), weights["action_high"].numpy()
     agent = module.Agent(len(weights["obs_mean"]), *bounds, restore_args(module.Args, saved))
-    agent.load_state_dict(agent.critic.state_dict(prefix="critic.") | weights)  # it has no critic
+    agent.load_state_dict(agent.state_dict() | weights)  # policy.pt has no critic
     return agent, saved["task"], script.name
