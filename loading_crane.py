@@ -28,7 +28,6 @@ from crane_env import GENTLE_FORCE, LOG_LENGTH, MIN_CLEARANCE, Q8_MAX, SPEED_LIM
 from hydraulic_crane import HydraulicCraneVectorEnv
 
 # ---- the bunk, as in assets/crane.xml, and what "loaded" means
-
 BED, STAKE_TOP, STAKE_Y = 1.2, 2.7, 1.2  # m: above the ground; from the truck's axis
 BUNK_X = (-6.5, -1.16)  # m, from the last stakes to the headboard
 PLACE_X, STAKE_GAP = -4.1, 1.6  # m: half way between two pairs of stakes; their distance
@@ -40,14 +39,12 @@ GENTLE_SPEED, CONTACTS = 1.0, 4  # m/s, of a log that meets the bed, a fall of 5
 LOG_VELOCITY, LOG_TURNING = slice(10, 13), slice(13, 15)  # of qvel; turning across its own axis
 
 # ---- easy starts on the way to the bunk: a log in closed jaws, as stiff servos hold it there
-
 HELD_SHARE = 0.4  # of the cranes at difficulty 0; none at 1
 HELD_JOINTS = [1.1, 0.05, 0.0], [1.2, 0.15, 0.4]  # q2, q3, q4: tip 4 to 5 m out, 4.7 to 5.7 m up
 GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
 GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
 
 # ---- the reward; a later stage adds to what all earlier ones pay; weights: docs/learned.md
-
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
 LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
 HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
@@ -156,6 +153,10 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         hit = np.linalg.norm(self.on_bed.reshape(-1, CONTACTS, 4)[..., 1:], axis=-1).max(axis=-1)
         self.bed_speed = np.maximum(self.bed_speed, hit)
         self.ground_peak = np.maximum(self.ground_peak, hit * GENTLE_FORCE / GENTLE_SPEED)
+
+    def reached(self, info: dict[str, Array]) -> Array:
+        """As for lifting. A log that was lifted has been reached, wherever the jaws hold it."""
+        return super().reached(info) | self.lifted
 
     def observation_limits(self) -> Array:
         high = np.array([20.0, 20.0, 20.0, np.pi / 2, np.pi / 2])

@@ -168,6 +168,15 @@ def test_a_held_log_that_is_dropped_is_lost_and_its_start_is_not_repeated():
     assert "log_lost" in endings and not envs.failures[0]
 
 
+def test_a_lifted_log_has_been_reached():
+    """Both logs lie away from the grapple. The second was lifted, wherever the jaws held it."""
+    envs = LoadingCraneVectorEnv(2, env_threads=1, autoreset=False)
+    envs.reset(seed=0)
+    envs.lifted[:] = [False, True]
+    info = envs.step(np.zeros((2, 6)))[-1]
+    assert (info["d_combine"] > 0.35).all() and [*info["time_to_reach"]] == [np.inf, 0.1]
+
+
 def test_a_log_must_be_lifted_within_12_s():
     """Crane 0 has reached its log and not lifted it; crane 1 had lifted the log that lies there."""
     envs = LoadingCraneVectorEnv(2, env_threads=1, autoreset=False)
