@@ -61,7 +61,7 @@ LET_GO_WEIGHT = 6.0  # for a command to open there: squeezing jaws find no other
 RELEASE_WEIGHT = 4.0  # for jaws that open there
 OFF_WEIGHT = 2.0  # for open jaws that do not touch the log
 LOADED_PAY = 60 * (LIFTED_PAY + 24.5)  # more than 50 steps of staying: gamma up to 0.98
-GENTLE_BONUS = 0.75  # added share of r_release and r_loaded; none from 60 kN on, a fall of 0.45 m
+GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
 
 def over_bunk(state: CraneState) -> Array:
@@ -194,7 +194,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
         lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
-        gentle = 1 + GENTLE_BONUS * np.clip((3 - self.ground_peak / GENTLE_FORCE) / 2, 0, 1)
+        gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
         holds, last = self.conditions(state, info), self.hold_steps - 1
         loaded = [ok & (self.streaks.get(name, 0) >= last) for name, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
