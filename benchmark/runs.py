@@ -6,9 +6,9 @@
     python benchmark/runs.py --only curves/ppo --quick   # does it work? tiny runs, in a new folder
 
 The run curves/ppo_crane_seed21 gets a row an update in benchmark/results/curves/. If its file is
-there, it is not made again. Two trainings run side by side with one thread each, those of timed/
-alone with two. Ctrl-C stops them after their update, and the next call resumes them from
-benchmark/runs/. After a change of the task delete that folder.
+there, it is not made again. Two trainings run side by side with one thread each, those whose
+minutes count alone with two. Ctrl-C stops them after their update, and the next call resumes them
+from benchmark/runs/. After a change of the task delete that folder.
 
 Final policies of curves/, levels/, loading/ and short/ get 600 trials of seed 60000 with exact pose
 and 600 with pose errors: benchmark/results/evaluations.csv, without runs whose own file is gone.
@@ -96,7 +96,7 @@ ABLATIONS = {  # what it is in the figure, script and flags
                      "--minibatch-size 5120 --total-timesteps 3072000 --gamma 0.99393 "
                      "--gae-lambda 0.98979 --reward-scale 0.012"),
 }  # fmt: skip
-SHORT, EXACT = "--total-timesteps 614400 --eval-every 10 ", " --eval-trials 100"
+SHORT = "--total-timesteps 614400 --eval-every 10 "
 FIVE, THREE = range(21, 26), range(21, 24)
 TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
@@ -104,8 +104,6 @@ TRAININGS = [  # folder, name, script, flags, seeds
       for level in HARD for script, flags in HARD[level].items()],
     ("loading", f"{MPPO}_ideal", MPPO, CYCLE, THREE),
     ("short", MPPO, MPPO, "--total-timesteps 512000 --eval-every 8", THREE),
-    ("timed", MPPO, MPPO, EXACT, [21]),
-    *[("timed", f"{MPPO}_{level}", MPPO, HARD[level][MPPO] + EXACT, [21]) for level in HARD],
     *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],
 ]  # fmt: skip
@@ -128,6 +126,12 @@ class Run(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.folder}/{self.name}_seed{self.seed}"
+
+    @property
+    def alone(self) -> bool:
+        """Whether it has two cores for itself, as README's command has: its minutes count."""
+        both = self.folder == "curves" or (self.folder == "levels" and self.seed == 21)
+        return both and self.script == MPPO
 
 
 RUNS = [Run(*training, seed) for *training, seeds in TRAININGS for seed in seeds]
@@ -207,7 +211,7 @@ def evaluate(policy: str, noise: str, *flags: str) -> dict[str, float]:
 
 def make(run: Run, here: Path, quick: bool) -> str:
     """Train or resume a run, evaluate its policy and write its rows. Returns what happened."""
-    label, threads = f"{run.folder}_{run.name}", "2" if run.folder == "timed" else "1"
+    label, threads = f"{run.folder}_{run.name}", "2" if run.alone else "1"
     folders = f"runs/*__{label}__{run.seed}__*"
     command = [sys.executable, str(ROOT / f"{run.script}.py"), "--threads", threads]
     if begun := sorted(here.glob(f"{folders}/checkpoint.pt")):
@@ -259,7 +263,7 @@ def main() -> None:
     with tqdm(total=len(runs), initial=len(runs) - len(missing), unit="run") as bar:
         for side_by_side, alone in ((2, False), (1, True)):
             pool = ThreadPoolExecutor(side_by_side)
-            chosen = [run for run in missing if (run.folder == "timed") == alone]
+            chosen = [run for run in missing if run.alone == alone]
             futures = [pool.submit(make, run, here, args.quick) for run in chosen]
             try:
                 for future in as_completed(futures):
