@@ -16,7 +16,7 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
 Advantages A, returns R and the time limit are as in ppo_crane.py. A is scaled over the rollout.
-Difficulty, policy width, horizon and the critic's step size follow schedules (docs/training.md).
+Difficulty, width, horizon, delta and the critic's step size follow schedules (docs/training.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
     python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
@@ -75,7 +75,7 @@ class Args:
     reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
     minibatch_size: Count = 1024  # steps per gradient step of the critic
     update_epochs: Count = 4  # passes of the critic over each rollout
-    target_kl: Factor = 0.04  # delta, bound of the mean KL divergence of one step
+    target_kl: Factor = 0.04  # delta at the start, bound of the mean KL divergence of one step
     cg_iters: Count = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
     fisher_samples: Count = 1024  # steps of each rollout whose F gives the step's direction
@@ -207,9 +207,7 @@ def surrogate_and_kl(
 
 
 @torch.no_grad()
-def line_search(
-    agent: Agent, full_step: Tensor, batch: tuple[Tensor, Tensor, Tensor, Normal], args: Args
-) -> tuple[float, float, float]:
+def line_search(agent: Agent, full_step: Tensor, batch: tuple, delta: float, args: Args) -> tuple:
     """Move the policy along full_step. Returns the accepted fraction, the KL and the improvement.
 
     batch: obs, actions, advantages and old policy, as `surrogate_and_kl` takes them. If no fraction
@@ -221,7 +219,7 @@ def line_search(
         fraction = args.backtrack_coeff**k
         nn.utils.vector_to_parameters(start + fraction * full_step, agent.policy_parameters())
         surrogate, kl = surrogate_and_kl(agent, *batch)
-        if kl <= args.target_kl and surrogate > old_surrogate:
+        if kl <= delta and surrogate > old_surrogate:
             return fraction, kl.item(), (surrogate - old_surrogate).item()
     nn.utils.vector_to_parameters(start, agent.policy_parameters())
     return 0.0, 0.0, 0.0
@@ -329,8 +327,9 @@ if __name__ == "__main__":
         matvec = fisher_vector_product(agent, b_obs[sample], args.cg_damping)
         direction = conjugate_gradient(matvec, gradient, args.cg_iters)
         curvature = direction @ fisher_vector_product(agent, b_obs, args.cg_damping)(direction)
-        full_step = torch.sqrt(2 * args.target_kl / (curvature + 1e-12)) * direction
-        fraction, kl, improvement = line_search(agent, full_step, batch, args)
+        delta = left * args.target_kl
+        full_step = torch.sqrt(2 * delta / (curvature + 1e-12)) * direction
+        fraction, kl, improvement = line_search(agent, full_step, batch, delta, args)
         stats = defaultdict(list)
         stats["losses/policy_loss"].append(-(surrogate.item() + improvement))
         stats["losses/entropy"].append(old.entropy().sum(-1).mean().item())

@@ -103,6 +103,7 @@ class Reference:
         args, n, self.actions = self.args, len(obs), actions.double()
         self.iteration += 1
         left = 1 - (self.iteration - 1) / args["iterations"]
+        self.delta = left * args.get("target_kl", 0.0)
         self.growth = args["horizon_growth"] ** max(0.0, 1 - left / 0.75)
         self.gamma = 1 - (1 - args["gamma"]) / self.growth
         self.lr = left * args["learning_rate"]
@@ -272,12 +273,12 @@ class Reference:
         (gradient,) = torch.autograd.grad(before, at)
         direction = torch.linalg.solve(damped_fisher(sample), gradient)
         curvature = direction @ damped_fisher(everything) @ direction
-        full_step = torch.sqrt(2 * args["target_kl"] / curvature) * direction
+        full_step = torch.sqrt(2 * self.delta / curvature) * direction
         fraction, accepted, after, spent = 0.0, start, before, 0.0
         for k in range(args["backtrack_iters"]):
             trial = start + args["backtrack_coeff"] ** k * full_step
             reached, divergence = surrogate(trial), kl(trial, everything)
-            if divergence <= args["target_kl"] and reached > before:
+            if divergence <= self.delta and reached > before:
                 fraction, accepted = args["backtrack_coeff"] ** k, trial
                 after, spent = reached, divergence
                 break

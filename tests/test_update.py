@@ -243,6 +243,6 @@ def test_line_search_restores_exactly_what_it_cannot_improve(factor):
     surrogate, _ = module.surrogate_and_kl(agent, *batch)
     gradient = module.flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
     before = module.flat(agent.policy_parameters()).detach()
-    args = module.Args(target_kl=0.01)
-    assert module.line_search(agent, factor * gradient, batch, args) == (0.0, 0.0, 0.0)
+    step, args = factor * gradient, module.Args()
+    assert module.line_search(agent, step, batch, 0.01, args) == (0.0, 0.0, 0.0)
     assert torch.equal(before, module.flat(agent.policy_parameters()))
