@@ -65,12 +65,12 @@ class Args:
     num_steps: Count = 64  # steps per crane and rollout
     hidden_sizes: tuple[Count, ...] = (256, 256)  # hidden layers of the actor and of the critic
     lstm_size: Count = 64  # width of the memory that actor and critic read
-    learning_rate: Factor = 6e-4  # Adam's step size at the start
+    learning_rate: Factor = 4e-4  # Adam's step size at the start
     gamma: Share = 0.97  # discount per step at the start
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per step
     reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
     num_minibatches: Count = 4  # groups of cranes; one gradient step on the rollouts of each
-    update_epochs: Count = 4  # passes over each rollout
+    update_epochs: Count = 8  # passes over each rollout
     clip_coef: Factor = 0.2  # c, bound of the ratio's change
     target_kl: Factor = 0.04  # stop after the first epoch whose mean KL exceeds this
     ent_coef: Factor = 0.0  # c_e, weight of the entropy
