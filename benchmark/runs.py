@@ -72,9 +72,9 @@ HARD = {
         RECURRENT: RANDOMIZED + "--learning-rate 7e-4 --retry 0.5",
     },
 }
-CYCLE = f"--env-id {LOADING['ideal']} --total-timesteps 5120000 --learning-rate 1e-3 "
+CYCLE = f"--env-id {LOADING['ideal']} --total-timesteps 6144000 --learning-rate 1e-3 "
 CYCLE += "--curriculum 0.25 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
-CYCLE += "--eval-every 125"
+CYCLE += "--eval-every 150"
 ABLATIONS = {  # what it is in the figure, script and flags
     "default": ("mPPO, default", MPPO, ""),
     "exact": ("trained with the task's own physics steps, 5 ms", MPPO, "--physics-step 0"),
