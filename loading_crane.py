@@ -4,7 +4,8 @@ Starts and rules are those of crane_env.py; easy tasks also start on the way. Wi
 must lie in the bunk, between the stakes, within 15 degrees of the truck's axis, slower than 0.05
 m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded". A log that is not
 lifted within 12 s, or is lost later, ends it, too. The success is gentle if the crane itself never
-pressed on ground or truck with more than 20 kN, and the log never met the bed faster than 1 m/s.
+pressed on ground or truck with more than 20 kN, and the log never met the bed faster than 1 m/s. In
+`ground_peak` 1 m/s counts as 20 kN.
 
 Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. On the
 machine joint sensors and a camera that sees both ends of the log give them, here without noise.
@@ -60,8 +61,7 @@ LET_GO_WEIGHT = 6.0  # for a command to open there: squeezing jaws find no other
 RELEASE_WEIGHT = 4.0  # for jaws that open there
 OFF_WEIGHT = 2.0  # for open jaws that do not touch the log
 LOADED_PAY = 60 * (LIFTED_PAY + 24.5)  # more than 50 steps of staying: gamma up to 0.98
-GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_SPEED, less beyond
-AFTER_LIFT = 0.1  # share of r_ground then: opening jaws may touch the bed
+GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
 
 def over_bunk(state: CraneState) -> Array:
@@ -85,6 +85,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 
     REVISION, TIME_LIMIT = 1, 30.0  # s; the scripted crane takes 21 s, on hydraulic drives 25 s
     GOALS = ("loaded",)
+    GROUND_WEIGHT = 3.0  # less than for lifting: opening jaws may touch the bed
     SCRIPTED = "crane_utils.scripted_loading:ScriptedLoadingCrane"  # of eval_crane.py
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
@@ -148,7 +149,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
     # ---- what is observed, measured and rewarded, and what ends an episode
 
     def watch_bed(self) -> None:
-        """After each physics step: how fast the log meets the bed. 1 m/s counts as 20 kN."""
+        """After each physics step: how fast the log meets the bed, where they touch."""
         hit = np.linalg.norm(self.on_bed.reshape(-1, CONTACTS, 4)[..., 1:], axis=-1).max(axis=-1)
         self.bed_speed = np.maximum(self.bed_speed, hit)
         self.ground_peak = np.maximum(self.ground_peak, hit * GENTLE_FORCE / GENTLE_SPEED)
@@ -176,7 +177,6 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         height = np.minimum(info["clearance"], crane_env.DESIRED_HEIGHT)  # higher pays no less
         terms = super().reward_terms(state, info | {"clearance": height})
         terms.pop("r_balance")
-        terms["r_ground"] = np.where(self.lifted, AFTER_LIFT, 1.0) * terms.get("r_ground", 0.0)
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         over = over_bunk(state) & (lowest >= BED - HIT)
         askew = np.arccos(np.minimum(np.abs(state.log_axis[:, 0]), 1))  # rad, turned or tilted
@@ -194,7 +194,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
         lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
-        gentle = 1 + GENTLE_BONUS * GENTLE_SPEED / np.maximum(self.bed_speed, GENTLE_SPEED)
+        gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
         holds, last = self.conditions(state, info), self.hold_steps - 1
         loaded = [ok & (self.streaks.get(name, 0) >= last) for name, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
@@ -235,7 +235,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):
     """N hydraulic cranes that load. Its hooks call those of the loading crane."""
 
-    REVISION = 1
+    REVISION, GROUND_WEIGHT = 1, 10.0
 
 
 class HydraulicLoadingCraneEnv(crane_env.CraneEnv):
