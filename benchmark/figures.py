@@ -230,11 +230,11 @@ def drives() -> None:
 
 def pictures(
     policy: str, diameter: float, trial: int = 0, every: int = 1, label: str = "",
-    size: tuple[int, int] = (400, 300), camera: str = "overview",
+    size: tuple[int, int] = (400, 300),
 ) -> list[Image.Image]:  # fmt: skip
     """Labelled pictures of a trial of seed 60000, one in `every` steps and the last."""
     agent, task, _ = eval_crane.load_policy(policy)
-    look = {"render_mode": "rgb_array", "camera": camera, "decorate": decorate}
+    look = {"render_mode": "rgb_array", "decorate": decorate}
     look |= {"width": size[0], "height": size[1], "diameter": diameter, "autoreset": False}
     crane = trials.make_envs(task["env_id"], 1, 1, task["options"], **look).unwrapped
     seeds = trials.monte_carlo_trials(trials.REPORT_SEED, trial + 1, [diameter])[1]
