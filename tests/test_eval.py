@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import importlib
 import json
 import shutil
 import subprocess
@@ -445,3 +446,17 @@ def test_stable_baselines_sees_the_same_cranes(monkeypatch):
     view.set_attr("difficulty", 0.25)
     assert view.envs.difficulty == 0.25 and view.get_attr("difficulty", [1]) == [0.25]
     assert view.env_is_wrapped(VecMonitor) == [False] * 5
+
+
+def test_an_edited_script_may_call_its_critic_otherwise(tmp_path, monkeypatch):
+    code = (ROOT / "ppo_crane.py").read_text(encoding="utf-8")
+    (tmp_path / "renamed_ppo.py").write_text(code.replace("critic", "judge"), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    script = importlib.import_module("renamed_ppo")
+    args = script.Args(hidden_sizes=(8,))
+    agent = script.Agent(18, -np.ones(6, "f4"), np.ones(6, "f4"), args)
+    run = {"script": "renamed_ppo.py", "args": asdict(args), "task": {"env_id": "ForestryCrane-v0"}}
+    runs.write(tmp_path / "policy.pt", run | {"weights": agent.state_dict()})
+    obs = np.ones((3, 18), "f4")
+    loaded = runs.load_policy(tmp_path)[0]
+    np.testing.assert_array_equal(loaded.predict(obs)[0], agent.predict(obs)[0])
