@@ -92,7 +92,6 @@ LOG_DENSITY = 650.0  # kg/m^3, the low end of green spruce; the paper does not g
 D_MIN, D_MAX = 0.3, 0.8  # m, log diameter (paper)
 REACH_DISTANCE = 0.35  # m, epsilon of d_combine, not published (docs/learned.md, Reward)
 LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre (paper)
-LIMIT_TOLERANCE = 0.02  # rad or m; under full servo force a soft stop gives 0.005 rad or 0.012 m
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
 MAX_MISS = 0.3  # m along the log, between grapple centre and log centre
 GENTLE_FORCE = 20e3  # N, of the crane on the ground; its moving parts weigh 19.5 kN
@@ -319,6 +318,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     TIME_LIMIT = 9.0  # s, of an episode (paper, Tables I and II)
     REACH_TIME = 6.0  # s, by which the log must have been reached (paper)
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
+    LIMIT_TOLERANCE = 0.02  # rad, m; at full servo force a soft stop gives 0.005 rad or 0.012 m
     GOALS: tuple[str, ...] = ()  # names of `rules` that end an episode well where it is `safe`
     COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_DISCRETE  # of a larger physics_step
     PIECE = 0.025  # s between two clamps of the integrators (assets/README.md)
@@ -703,7 +703,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """What ends an episode early (Sec. IV-B3), (N,) bool each, by name. The first counts."""
         q, (low, high) = state.q, self.joint_range.T
-        beyond = (q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE)
+        beyond = (q < low - self.LIMIT_TOLERANCE) | (q > high + self.LIMIT_TOLERANCE)
         away = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
         too_late = info["time"] > self.REACH_TIME - 1e-9
         return {

@@ -84,7 +84,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
     """N cranes that load. `bed_speed` (N,): m/s, the fastest that the log met the bed."""
 
     REVISION, TIME_LIMIT = 1, 30.0  # s; the scripted crane takes 21 s, on hydraulic drives 25 s
-    GOALS = ("loaded",)
+    GOALS, LIMIT_TOLERANCE = ("loaded",), 0.03  # m; under a log the telescope's stop gives 0.022
     GROUND_WEIGHT = 3.0  # less than for lifting: opening jaws may touch the bed
     SCRIPTED = "crane_utils.scripted_loading:ScriptedLoadingCrane"  # of eval_crane.py
 

@@ -105,6 +105,17 @@ def test_force_on_the_truck_counts():
     assert info["ground_peak"] > GENTLE_FORCE
 
 
+@pytest.mark.parametrize("cranes, ends", [(CraneVectorEnv, True), (LoadingCraneVectorEnv, False)])
+def test_a_stop_that_gives_under_the_log_ends_nothing(cranes, ends):
+    """A telescope 2.5 cm inside its stop, where a log in the jaws may push it."""
+    envs = cranes(1, env_threads=1)
+    envs.reset(seed=0)
+    state = envs.state()
+    state.q[0, 3] = -0.025
+    info = envs.measure(state) | dict.fromkeys(("time", "diverged", "safe"), np.zeros(1))
+    assert envs.rules(state, info)["joint_limit_q4"] == ends
+
+
 def test_a_crane_that_stands_on_the_log_has_not_let_go():
     envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
     put(envs, -4.1, 0, 1.6, 0.8)

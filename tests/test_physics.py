@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import crane_env
-from crane_env import ACTUATED, JOINTS, LIMIT_TOLERANCE, CraneVectorEnv, log_clearance
+from crane_env import ACTUATED, JOINTS, CraneVectorEnv, log_clearance
 from hydraulic_crane import HydraulicCraneVectorEnv
 
 DH = {  # a, d, alpha of the Denavit-Hartenberg table in assets/README.md; q4 twice
@@ -168,7 +168,7 @@ def test_resting_in_an_end_stop_ends_no_episode():
         assert (info["termination"] == "none").all()
         beyond.append(outward * (envs.state().q[each, joint] - stop))
     assert np.min(beyond[-20:]) > 0  # in the stop, not on the way to it
-    assert 0.012 < np.max(beyond) < LIMIT_TOLERANCE
+    assert 0.012 < np.max(beyond) < envs.LIMIT_TOLERANCE
 
 
 @pytest.mark.parametrize("cranes, drift", [(CraneVectorEnv, 2e-4), (HydraulicCraneVectorEnv, 0.02)])
