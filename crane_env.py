@@ -101,7 +101,7 @@ POSE_NOISE = 0.1  # bound of epsilon_p and epsilon_o (paper, Sec. V-D)
 # ---- the reward
 
 OMEGA2 = 1.0  # 1/m, sharpness of r_distance; the paper does not give it
-DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward; the paper does not give it
+DESIRED_HEIGHT = 1.0  # m, z_l,d of the printed reward, unpublished; also of the loading crane
 GRAPPLE_WEIGHT = 2.0  # largest staged r_grapple; with 1 some seeds never closed the jaws
 LIFT_WEIGHT = 2.0  # largest part of staged r_lift that height earns; CARRY_WEIGHT adds to it
 BALANCE_WEIGHT = 3.0  # largest staged r_balance: a log that hangs still pays most
@@ -187,8 +187,7 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
-    # (N,) 1 - (force of log and crane on the ground) / (weight of the log), clipped to [0, 1]
-    carried: Array | float = 0.0
+    carried: Array  # (N,) 1 - (force of log and crane on the ground) / (log's weight), in [0, 1]
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
@@ -332,7 +331,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
         difficulty: float = 1.0,
         retry: float = 0.0,
-        physics_step: float = 0.0,  # s, at most; never below that of crane.xml, 0.005
+        physics_step: float = 0.0,  # s; above crane.xml's 0.005 up to a whole step; sdf: ignored
         env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: Literal["human", "rgb_array"] | None = None,
         camera: Literal["overview", "side", "grapple"] = "overview",
@@ -358,11 +357,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         spec.compiler.discardvisual = render_mode is None  # the same motion, sooner
         self.dt = self.options.frame_skip * spec.option.timestep  # s, one step
         self.frame_skip = self.options.frame_skip  # physics steps in a step
-        if spec.option.timestep < physics_step <= self.dt:
+        if self.options.contact == "primitive" and spec.option.timestep < physics_step <= self.dt:
             self.frame_skip = int(np.ceil(self.dt / physics_step - 1e-9))
             spec.option.timestep = self.dt / self.frame_skip
             spec.option.integrator = self.COARSE_INTEGRATOR
-        self.piece = int(np.ceil(self.PIECE / spec.option.timestep - 1e-9))  # and in a piece
+        self.piece = int(np.ceil(self.PIECE / spec.option.timestep - 1e-9))  # physics steps
         spec.sensor("ground_force").nsample = self.piece
         self.model = model = spec.compile()
         self.max_steps = int(np.ceil(self.TIME_LIMIT / self.dt - 1e-9))
@@ -433,19 +432,19 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info = self.measure(state) | {"time": time, "diverged": diverged}
         reached = self.reached(info) & (time < self.REACH_TIME + 1e-9)
         self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
-        terms = self.of_each(self.reward_terms(state, info))
+        terms = self.checked(self.reward_terms(state, info))
         terms = {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
         info |= terms | {"time_to_reach": self.reach_time.copy()}
         reward = sum(terms.values())
 
         # success: each condition held at every step of the last HOLD_TIME
-        holds = self.of_each(self.conditions(state, info))
+        holds = self.checked(self.conditions(state, info))
         self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
         held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
         info["safe"] = np.all([*held.values()], axis=0)
 
         # rules
-        rules = self.of_each(self.rules(state, info))
+        rules = self.checked(self.rules(state, info))
         rules |= {"time_limit": time > self.TIME_LIMIT - 1e-9}
         ending = np.select([*rules.values()], [*rules], default="none")
         done, truncated = ending != "none", ending == "time_limit"
@@ -463,8 +462,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 self.failures[i].append(self.starts[i])
 
         # autoreset
-        of_ends = ("success", "is_success", "gentle", "failure")
-        info |= {f"_{key}": done | (key not in of_ends) for key in info}
+        at_ends = ("success", "is_success", "gentle", "failure")
+        info |= {f"_{key}": done | (key not in at_ends) for key in info}
         if self.autoreset and done.any():
             info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
@@ -477,7 +476,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.render()
         return obs, reward, terminated, truncated, info
 
-    def of_each(self, values: dict[str, Array]) -> dict[str, Array]:
+    def checked(self, values: dict[str, Array]) -> dict[str, Array]:
         """What a hook returned. ValueError names a value that NumPy would silently repeat."""
         for name, value in values.items():
             if np.shape(value) != self.steps.shape:
@@ -582,18 +581,19 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """frame_skip physics steps under `command`; which cranes diverged, (N,)."""
         failed = np.zeros(self.num_envs, bool)
         self.impact[:] = 0.0
-        # Anti-windup: an integrator leads its joint by no more than the force limit can use. This
-        # lead keeps squeezing the log at zero command, as a check valve does.
-        every = max(1, self.piece // self.frame_skip)  # steps to a piece, where they are shorter
-        due = self.steps % every == 0
-        left = self.frame_skip  # physics steps to go
+        steps_per_piece = max(1, self.piece // self.frame_skip)
+        due = self.steps % steps_per_piece == 0
+        left = self.frame_skip  # physics steps
         while left:
             nstep = min(self.piece, left)
-            self.drive(np.flatnonzero(due), nstep * every * self.model.opt.timestep)
+            self.drive(np.flatnonzero(due), nstep * steps_per_piece * self.model.opt.timestep)
+            # Anti-windup: an integrator leads its joint by no more than the force limit can use.
+            # This lead keeps squeezing the log at zero command, as a check valve does.
             low, high = self.qpos[:, SERVOS] + self.force_limit / self.servo_kp
             np.clip(self.act, low, high, out=self.act, where=due[:, None])
             self.ground_force[:] = 0.0  # a hit of an earlier piece is not this one's
-            for size in [1] * nstep if self.observers else [nstep]:
+            size = 1 if self.observers else nstep
+            for _ in range(nstep // size):
                 left -= size  # sensors are needed after the last physics step only
                 stage = mujoco.mjtStage.mjSTAGE_NONE if left else VEL
                 try:
@@ -611,7 +611,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def warned(self) -> Array:
         """Which cranes the engine has warned of since their start, (N,) bool."""
-        return self.batch.warning[:, :, 1].any(axis=-1)
+        return self.batch.warning[:, :, 1].any(axis=-1)  # 1: how often each warning came
 
     def drive(self, ids: Array, seconds: float) -> None:
         """Set `ctrl` of cranes `ids`, in which a piece begins, for the next seconds."""
@@ -766,31 +766,31 @@ class CraneEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed)
-        return obs[0], self.of_one(info)
+        return obs[0], self.first_crane(info)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """`CraneVectorEnv.step` without autoreset. action (6,)."""
-        obs, *numbers, info = self.envs.step(np.asarray(action)[None])
-        return obs[0], *[number.item() for number in numbers], self.of_one(info)
+        obs, reward, terminated, truncated, info = self.envs.step(np.asarray(action)[None])
+        return obs[0], reward.item(), terminated.item(), truncated.item(), self.first_crane(info)
 
-    def of_one(self, info: dict[str, Array]) -> dict[str, Any]:
+    def first_crane(self, info: dict[str, Array]) -> dict[str, Any]:
         """The one crane's info, in Python's numbers, bools and strings."""
         one = {key: value[0] for key, value in info.items() if key[0] != "_"}
         return {key: value.item() if np.ndim(value) == 0 else value for key, value in one.items()}
 
     def render(self) -> Array | None:
         frames = self.envs.render()
-        return frames and frames[0]
+        return frames[0] if frames else None
 
     def close(self) -> None:
         self.envs.close()
 
 
-PAPER = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
-PAPER |= {"signed_yaw": False, "axes": "world"}
+PAPER_OPTIONS = {"frame_skip": 1, "contact": "sdf", "reward": "paper", "offset": "minus"}
+PAPER_OPTIONS |= {"signed_yaw": False, "axes": "world"}
 for name, kind, kwargs in [
     ("ForestryCrane", "crane_env:Crane", {}),
-    ("ForestryCranePaper", "crane_env:Crane", PAPER),
+    ("ForestryCranePaper", "crane_env:Crane", PAPER_OPTIONS),
     ("ForestryCraneHydraulic", "hydraulic_crane:HydraulicCrane", {}),  # beyond the paper from here
     ("ForestryCraneRandomized", "hydraulic_crane:HydraulicCrane", {"randomize": 1.0}),
     ("ForestryCraneLoading", "loading_crane:LoadingCrane", {}),

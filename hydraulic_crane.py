@@ -28,7 +28,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 import crane_env
-from crane_env import ACTION_OF_SERVO, INTEGRATORS, SERVOS, CraneState, centred, speed_limit
+from crane_env import ACTION_OF_SERVO, INTEGRATORS, SERVOS, CraneState, speed_limit
 
 # ---- the drives; six numbers belong to q1, q2, q3, each telescope stage, q7 and q8
 
@@ -197,7 +197,8 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         drawn = {name: values[ids] for name, values in self.drawn.items()}
         self.density[ids] = drawn["density"]
         super().set_constants(ids, radius)
-        self.servo_kp[ids] = stiffness = drawn["stiffness"][:, ACTION_OF_SERVO]
+        stiffness = drawn["stiffness"][:, ACTION_OF_SERVO]
+        self.servo_kp[ids] = stiffness
         engine["actuator_gainprm"][ids, INTEGRATORS, 0] = stiffness
         engine["actuator_biasprm"][ids, INTEGRATORS, 1] = -stiffness
         delay = model.actuator_delay[INTEGRATORS] + drawn["extra_delay"][:, None]
@@ -216,14 +217,14 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     def limit_forces(self, ids: Array) -> None:
         """No drive of cranes `ids` pushes harder than PRESSURE allows where its joint is now."""
-        self.levers[:, ids] = levers = cylinder_levers(*self.qpos[ids, 1:3].T)
-        way = np.ones((len(ids), 6))
-        heavy = np.inf * way  # the telescope may use its full area
-        areas = [oil_per_movement(levers, sign * way, heavy) for sign in (-1, 1)]
+        levers = cylinder_levers(*self.qpos[ids, 1:3].T)
+        speed = np.ones((len(ids), 6))  # below at any load: the telescope may use its full area
+        areas = [oil_per_movement(levers, sign * speed, np.inf * speed) for sign in (-1, 1)]
         most = (PRESSURE * np.array(areas) / SERVOS_OF_ACTION)[:, :, ACTION_OF_SERVO]
         most = np.minimum(most, self.model.jnt_actfrcrange[SERVOS, 1])
-        self.force_limit[:, ids] = low, high = -most[0], most[1]
-        self.engine["actuator_forcerange"][ids, INTEGRATORS] = np.stack([low, high], axis=-1)
+        limits = np.stack([-most[0], most[1]])
+        self.levers[:, ids], self.force_limit[:, ids] = levers, limits
+        self.engine["actuator_forcerange"][ids, INTEGRATORS] = np.moveaxis(limits, 0, -1)
 
     def spring_force(self) -> Array:
         """Force of the oil on each servo's joint, (N, 8), N m and N."""
@@ -290,7 +291,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         closed, grip = super().grasp(state, miss)
         held = state.touching.all(axis=-1)
         closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
-        return closed, centred(miss) * np.clip(0.5 + grip_depth(state), 0, 1)
+        return closed, grip * np.clip(0.5 + grip_depth(state), 0, 1)
 
 
 class HydraulicCraneEnv(crane_env.CraneEnv):

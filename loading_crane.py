@@ -60,7 +60,7 @@ MOST_ASKEW = np.radians(30)  # of a log to let go; with 15 jaws never opened: fa
 LET_GO_WEIGHT = 6.0  # for a command to open there: squeezing jaws find no other way
 RELEASE_WEIGHT = 4.0  # for jaws that open there
 OFF_WEIGHT = 2.0  # for open jaws that do not touch the log
-LOADED_PAY = 60 * (LIFTED_PAY + 24.5)  # more than 50 steps of staying: gamma up to 0.98
+LOADED_PAY = 60 * 30.5  # 30.5: what all stages above pay; more than 50 steps: gamma up to 0.98
 GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
 
@@ -96,14 +96,14 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         bed, crane = (self.model.sensor(name).adr[0] for name in ("log_on_bed", "crane_on_log"))
         self.on_bed = self.sensordata[:, bed : bed + 4 * CONTACTS]  # both live
         self.on_log = self.sensordata[:, crane]
-        self.observers.append(lambda envs: envs.watch_bed())
+        self.observers.append(LoadingCraneVectorEnv.watch_bed)
 
     def make_spec(self) -> mujoco.MjSpec:
-        """The truck joins the ground's body, so that `ground_force` feels it, too."""
+        """The truck joins the ground's body: it, too, is pressed on, and it, too, bears the log."""
         spec = super().make_spec()
         spec.compiler.fusestatic = True
-        force = spec.sensor("ground_force")
-        force.reftype, force.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
+        for sensor in (spec.sensor("ground_force"), spec.sensor("log_support")):
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
         contact = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "reftype": mujoco.mjtObj.mjOBJ_BODY}
         # data of a contact, which of them, how many: "found linvel", any, CONTACTS; "found", any, 1
         contact |= {"refname": "log", "objtype": mujoco.mjtObj.mjOBJ_GEOM}
@@ -118,7 +118,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         A share of the cranes and not of the starts: held episodes are long and would be most steps.
         """
         if self.starts_held[i]:  # it began elsewhere than `starts` says: nothing to repeat
-            self.failures[i].clear(), self.recent_success[i].clear()
+            self.failures[i].clear()
         q, log_pose, diameter = super().draw_episode(i)
         self.starts_held[i] = i + 0.5 < HELD_SHARE * (1 - self.difficulty) * self.num_envs
         if self.starts_held[i]:
@@ -186,7 +186,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         high = 1 - (lowest - TOO_HIGH) / (HIGHEST - TOO_HIGH)
         up = np.clip(np.where(over, high, np.minimum(lowest / CARRY_HEIGHT, high)), 0, 1) * held
         to_go = np.pi - np.abs(np.arctan2(y, x))  # rad round the slew axis
-        radius_miss = (np.hypot(x, y) + PLACE_X) / RADIUS_MISS
+        radius_miss = (np.hypot(x, y) - abs(PLACE_X)) / RADIUS_MISS
         near = np.exp(-(radius_miss**2)) * np.clip(1 - to_go / SWING_ANGLE, 0, 1)
         there, middle = up * near, over * np.exp(-((y / MIDDLE_MISS) ** 2))
         along, straight = 1 - askew / (np.pi / 2), np.clip(1 - askew / MOST_ASKEW, 0, 1)
@@ -225,7 +225,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
         self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
-        dropped = (self.loose > 0) & (lowest < SETTLED) | (self.loose >= self.hold_steps)
+        dropped = ((self.loose > 0) & (lowest < SETTLED)) | (self.loose >= self.hold_steps)
         lost = self.lifted & dropped & (outside | (lowest < BED - HIT))
         ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}
         self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)

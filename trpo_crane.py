@@ -27,7 +27,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -91,17 +90,15 @@ class Args:
     narrowing: float = 0.3  # fall of log sigma in the run
 
 
-def layer_init(layer: nn.Linear, std: float = np.sqrt(2)) -> nn.Linear:
-    nn.init.orthogonal_(layer.weight, std)
-    nn.init.zeros_(layer.bias)
-    return layer
-
-
-def mlp(sizes: list[int], std: float) -> nn.Sequential:
-    layers = []
-    for inputs, outputs in pairwise(sizes[:-1]):
-        layers += [layer_init(nn.Linear(inputs, outputs)), nn.Tanh()]
-    return nn.Sequential(*layers, layer_init(nn.Linear(*sizes[-2:]), std))
+def mlp(sizes: list[int], last_gain: float) -> nn.Sequential:
+    """Linear layers of these sizes with tanh between them. last_gain: of the last one's weights."""
+    layers, gains = [], [np.sqrt(2)] * (len(sizes) - 2) + [last_gain]
+    for inputs, outputs, gain in zip(sizes, sizes[1:], gains):
+        layer = nn.Linear(inputs, outputs)
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+        layers += [layer, nn.Tanh()]
+    return nn.Sequential(*layers[:-1])
 
 
 class Agent(nn.Module):
@@ -109,9 +106,9 @@ class Agent(nn.Module):
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
-        self.actor = mlp([obs_dim, *args.hidden_sizes, len(action_low)], std=0.01)
+        self.actor = mlp([obs_dim, *args.hidden_sizes, len(action_low)], last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
-        self.critic = mlp([obs_dim, *args.hidden_sizes, 1], std=1.0)
+        self.critic = mlp([obs_dim, *args.hidden_sizes, 1], last_gain=1.0)
         self.register_buffer("action_low", torch.as_tensor(action_low))
         self.register_buffer("action_high", torch.as_tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
@@ -288,7 +285,7 @@ if __name__ == "__main__":
         envs.unwrapped.difficulty = difficulty(iteration)
 
         # Rollout
-        start, infos = time.perf_counter(), []
+        began, infos = time.perf_counter(), []
         torch.set_num_threads(1)  # the batches are too small for more
         for step in range(args.num_steps):
             with torch.no_grad():
@@ -322,7 +319,7 @@ if __name__ == "__main__":
         batch = (b_obs, b_actions, adv, old)
         surrogate, _ = surrogate_and_kl(agent, *batch)
         gradient = flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
-        # F of a sample gives a good direction, but a length with which KL exceeds delta.
+        # F of a sample gives a good direction, but a length with which KL can exceed delta.
         sample = torch.randperm(batch_size, device=device)[: args.fisher_samples]
         matvec = fisher_vector_product(agent, b_obs[sample], args.cg_damping)
         direction = conjugate_gradient(matvec, gradient, args.cg_iters)
@@ -351,12 +348,12 @@ if __name__ == "__main__":
 
         # Log
         global_step = iteration * batch_size
-        stats = {name: np.mean(values) for name, values in stats.items()}
+        stats = {name: np.mean(numbers) for name, numbers in stats.items()}
         stats |= trials.rollout_report(envs, infos)
-        explained = 1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()
+        explained = 1 - (b_advantages.var() / (b_returns.var() + 1e-8)).item()  # A = R - V
         stats |= {"losses/explained_variance": explained, "schedule/gamma": gamma}
         stats["charts/learning_rate"] = left * args.learning_rate
-        stats["charts/SPS"] = batch_size / (time.perf_counter() - start)
+        stats["charts/SPS"] = batch_size / (time.perf_counter() - began)
         runs.check_finite(iteration, stats, agent)
         for name, value in stats.items():
             writer.add_scalar(name, value, global_step)

@@ -20,7 +20,7 @@ def lying(x, y, z, yaw=0.0, tilt=0.0, diameter=0.4):
     none = np.zeros((1, 3))
     return CraneState(
         np.zeros((1, 8)), np.zeros((1, 6)), none, none, np.array([[x, y, z]]), np.array([axis]),
-        np.zeros((1, 2), bool), np.array([diameter]),
+        np.zeros((1, 2), bool), np.array([diameter]), np.zeros(1),
     )  # fmt: skip
 
 
