@@ -38,7 +38,6 @@ LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.130])  # s, of the valve, f
 DEAD_TIME = np.array([0.117, 0.080, 0.044, 0.060, 0.058, 0.058])  # s
 BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
 MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
-PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints
 PRESSURE = 25e6  # Pa, the pump's; no cylinder pushes harder than its area times this
 MIN_LEVER = 0.05  # m; below q2 = -1.13 rad the boom's computed lever is smaller or negative
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
@@ -141,6 +140,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
     REVISION = 8
     COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     PIECE = 0.02  # s between two looks of the valves at the command
+    PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints (assets/README.md)
     GROUND_WEIGHT, GROUND_MOST = 90.0, 3.0
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
@@ -249,7 +249,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         force = self.spring_force()[ids] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
         oil = oil_per_movement(self.levers[:, ids], mean, force)
         demand = np.sum(oil * np.abs(mean), axis=-1, keepdims=True)
-        return mean * np.minimum(1, PUMP_FLOW / np.maximum(demand, 1e-9))
+        return mean * np.minimum(1, self.PUMP_FLOW / np.maximum(demand, 1e-9))
 
     # ---- what is observed, measured and rewarded
 

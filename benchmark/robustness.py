@@ -28,12 +28,12 @@ from tqdm import tqdm
 
 import eval_crane
 from benchmark.runs import LABELS, LEVELS, LOADING, METRICS, RESULTS, ROOT, read_rows, write_rows
-from crane_env import ACTION_OF_SERVO, SERVOS
+from crane_env import SERVOS
 from crane_utils import runs
 from crane_utils import trials as protocol
 from crane_utils.scripted_loading import ScriptedLoadingCrane
 from crane_utils.trials import REPORT_SEED
-from hydraulic_crane import PUMP_FLOW, HydraulicCraneVectorEnv, oil_per_movement
+from hydraulic_crane import HydraulicCraneVectorEnv
 from scripted_crane import ScriptedCrane
 
 METHODS = {label: script for script, label in LABELS.items()} | {"scripted": "scripted"}
@@ -52,7 +52,7 @@ class ChangedCranes(HydraulicCraneVectorEnv):
 
     delay = 0.0  # s, more dead time of all drives
     pose_error = 0.0  # m, to a side that each crane keeps, of the log's reported place
-    pump = 1.0  # factor on its flow, 1 at most
+    pump = 1.0  # factor on its flow
     force = 1.0  # factor on the force limits
     slope = 0.0  # degrees, of a ground that falls along x
     friction = 1.0  # factor
@@ -60,6 +60,7 @@ class ChangedCranes(HydraulicCraneVectorEnv):
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         super().__init__(num_envs, **kwargs)
         self.drawn["friction"][:] = self.friction
+        self.PUMP_FLOW = self.pump * HydraulicCraneVectorEnv.PUMP_FLOW
         side = np.random.default_rng(0).uniform(0, 2 * np.pi, num_envs)
         error = [np.cos(side), np.sin(side), 0 * side]
         self.drawn["pose_error"] = self.pose_error * np.stack(error, axis=-1)
@@ -74,13 +75,6 @@ class ChangedCranes(HydraulicCraneVectorEnv):
         angle, g = np.radians(self.slope), spec.option.gravity[2]
         spec.option.gravity = [-g * np.sin(angle), 0, g * np.cos(angle)]
         return spec
-
-    def oil_speed(self, ids: np.ndarray, command: np.ndarray, seconds: float) -> np.ndarray:
-        speed = super().oil_speed(ids, command, seconds)
-        force = self.spring_force()[ids] @ np.eye(6)[ACTION_OF_SERVO]
-        flow = oil_per_movement(self.levers[:, ids], speed, force) * np.abs(speed)
-        flow = np.maximum(flow.sum(axis=-1, keepdims=True), 1e-9)
-        return speed * np.minimum(1, self.pump * PUMP_FLOW / flow)
 
 
 def policy_of(method: str, level: str) -> tuple[Any, int]:
