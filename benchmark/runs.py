@@ -55,22 +55,18 @@ LABELS = {  # of the scripts, in figures and tables
 
 MPPO, PPO, TRPO, RECURRENT = LABELS
 HYDRAULIC = f"--env-id {LEVELS['hydraulic']} --total-timesteps 1536000 --num-envs 128 "
+HYDRAULIC += "--curriculum 0.6 "
 RANDOMIZED = f"--env-id {LEVELS['randomized']} --total-timesteps 4096000 --num-envs 128 "
-RANDOMIZED += "--curriculum 0.2 "
-LARGE, FISHER = "--minibatch-size 2048 ", "--fisher-samples 2048 --cg-iters 5 --retry 0.5 "
+RANDOMIZED += "--curriculum 0.25 "
+OWN = {  # flags of the scripts on both harder levels
+    MPPO: "--learning-rate 1e-3",
+    PPO: "",
+    TRPO: "--fisher-samples 2048 --cg-iters 5 --retry 0.5",
+    RECURRENT: "--learning-rate 7e-4 --retry 0.5",
+}
 HARD = {
-    "hydraulic": {
-        MPPO: HYDRAULIC + LARGE + "--learning-rate 6e-4",
-        PPO: HYDRAULIC + LARGE,
-        TRPO: HYDRAULIC + LARGE + FISHER + "--curriculum 0.6",
-        RECURRENT: HYDRAULIC + "--learning-rate 7e-4 --retry 0.5",
-    },
-    "randomized": {
-        MPPO: RANDOMIZED + LARGE + "--learning-rate 7e-4",
-        PPO: RANDOMIZED + LARGE + "--learning-rate 7e-4",
-        TRPO: RANDOMIZED + LARGE + FISHER,
-        RECURRENT: RANDOMIZED + "--learning-rate 7e-4 --retry 0.5",
-    },
+    level: {script: flags + own for script, own in OWN.items()}
+    for level, flags in (("hydraulic", HYDRAULIC), ("randomized", RANDOMIZED))
 }
 CYCLE = f"--env-id {LOADING['ideal']} --total-timesteps 6144000 --learning-rate 1e-3 "
 CYCLE += "--curriculum 0.25 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
