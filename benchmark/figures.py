@@ -177,8 +177,8 @@ def robustness() -> None:
     save(figure, FIGURES / "robustness.svg")
 
 
-def response(axis: str, action: float, at_work: bool = False) -> Array:
-    """Speed / command after each of 250 physics steps, with the record's inertia or the own."""
+def response(axis: str, action: float, at_work: bool = False, step: float = 0.005) -> Array:
+    """Speed / command after each step of 1.25 s, with the record's inertia or the crane's own."""
     import mujoco  # after crane_env, which chooses its OpenGL
 
     _, inertia, pose = AXES[axis]
@@ -186,7 +186,8 @@ def response(axis: str, action: float, at_work: bool = False) -> Array:
     q = np.array([[-1.2, q2, q3, q4, np.pi / 2 - q2 - q3, np.pi / 2, 0, q8]])
     far_log = np.array([[-20.0, 0.0, 0.0]])  # out of the way
     start, i = (np.zeros(1, int), q, far_log, np.array([0.3])), [*AXES].index(axis)
-    crane = HydraulicCraneVectorEnv(1, env_threads=1, frame_skip=1, autoreset=False)
+    skip = {"frame_skip": round(step / 0.005), "physics_step": step}
+    crane = HydraulicCraneVectorEnv(1, env_threads=1, autoreset=False, **skip)
     crane.reset(seed=0)
     crane.place(*start)
     if not at_work:
@@ -200,12 +201,12 @@ def response(axis: str, action: float, at_work: bool = False) -> Array:
             view.mass[:] *= inertia / (moving @ momentum)
             view.inertia[:] *= inertia / (moving @ momentum)
         crane.place(*start)
-    speeds, actions = [], np.zeros((1, 6))
-    for step in range(290):
-        actions[0, i] = action * (step >= 40)
+    speeds, actions, rest = [], np.zeros((1, 6)), round(0.2 / step)
+    for k in range(rest + round(1.25 / step)):
+        actions[0, i] = action * (k >= rest)
         crane.step(actions)
         speeds.append(crane.state().dq[0, i])
-    return (np.array(speeds[40:]) - speeds[39]) / crane.command[0, i]
+    return (np.array(speeds[rest:]) - speeds[rest - 1]) / crane.command[0, i]
 
 
 def drives() -> None:

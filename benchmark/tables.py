@@ -180,6 +180,35 @@ def timed() -> str:
     return table([*header, "success at the end [%]"], lines)
 
 
+def ablations() -> str:
+    """ablations/: success of mPPO with one ingredient changed, one number a seed."""
+    lines, curves = [], read_curves("ablations")
+    for name, (label, _, _) in runs.ABLATIONS.items():
+        of_seed = curves.get(name, {})
+        ends = ("eval_success_rate", "eval_gentle_rate")
+        cells = [joined((100 * run[end][-1] for run in of_seed.values()), 1) for end in ends]
+        if of_seed:
+            lines.append([label, ", ".join(map(str, of_seed)), *cells])
+    return table(["change", "seeds", "success", "gentle"], lines)
+
+
+def robustness() -> str:
+    """robustness.csv: each change of the hydraulic crane at one value."""
+    shown = {"more dead time [s]": 0.06, "constant pose error [m]": 0.15}
+    shown |= {"slope of the ground [degrees]": 3.0, "friction, times": 0.6}
+    shown |= {"flow of the pump, times": 0.6, "force limits, times": 0.6}
+    of: dict[tuple[str, float], dict[str, str]] = defaultdict(dict)
+    for row in read_rows(RESULTS / "robustness.csv"):
+        of[row["changed"], float(row["value"])][row["method"]] = f"{float(row['success']):.0f}"
+    methods = list(dict.fromkeys(method for cells in of.values() for method in cells))
+    lines = [
+        [f"{changed}: {value:g}", *[of[changed, value].get(method, "") for method in methods]]
+        for changed, value in shown.items()
+        if (changed, value) in of
+    ]
+    return table(["change", *methods], lines)
+
+
 def speed() -> str:
     """throughput.csv: the ratios, a column a frame skip."""
     ratios: dict[str, dict[str, str]] = defaultdict(dict)
@@ -215,7 +244,8 @@ def held() -> str:
     return table(["policy", *LEVELS], lines)
 
 
-ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, speed, leaderboard)
+ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, ablations, robustness)
+ALL += (speed, leaderboard)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 
