@@ -138,7 +138,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     Options = Options
     REVISION = 8
-    COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    COARSE_INTEGRATOR, COARSE_HITS = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 0.7
     PIECE = 0.02  # s between two looks of the valves at the command
     PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints (assets/README.md)
     GROUND_WEIGHT, GROUND_MOST = 90.0, 3.0

@@ -71,6 +71,8 @@ HARD = {
 CYCLE = f"--env-id {LOADING['ideal']} --total-timesteps 6144000 --learning-rate 1e-3 "
 CYCLE += "--curriculum 0.25 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
 CYCLE += "--eval-every 150"
+PRINTED = "--total-timesteps 25000000 --eval-every 200 --env.reward paper --env.offset minus "
+PRINTED += "--env.signed-yaw False --env.axes world"  # 500 million physics steps, as in the paper
 ABLATIONS = {  # what it is in the figure, script and flags
     "default": ("mPPO, default", MPPO, ""),
     "exact": ("trained with the task's own physics steps, 5 ms", MPPO, "--physics-step 0"),
@@ -99,6 +101,7 @@ TRAININGS = [  # folder, name, script, flags, seeds
     *[("levels", f"{script}_{level}", script, flags, FIVE if level == "hydraulic" else THREE)
       for level in HARD for script, flags in HARD[level].items()],
     ("loading", f"{MPPO}_ideal", MPPO, CYCLE, THREE),
+    ("printed", MPPO, MPPO, PRINTED, (21,)),
     ("short", MPPO, MPPO, "--total-timesteps 512000 --eval-every 8", THREE),
     *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],

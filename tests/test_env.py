@@ -11,7 +11,7 @@ from gymnasium.wrappers.vector import DictInfoToList
 from reference_crane import FASTEST, RANGES, SLOWEST
 
 import crane_env
-from crane_env import ACTUATED, CraneEnv, CraneVectorEnv
+from crane_env import ACTUATED, GENTLE_FORCE, CraneEnv, CraneVectorEnv
 from hydraulic_crane import HydraulicCraneEnv, HydraulicCraneVectorEnv
 
 IDEAL, HYDRAULIC = (CraneEnv, CraneVectorEnv), (HydraulicCraneEnv, HydraulicCraneVectorEnv)
@@ -384,6 +384,19 @@ def test_coarser_physics_is_the_same_task(skip, physics_step, steps):
             envs.step(np.tile([0.4, 0.5, 0.2, 0.3, 0.3, 0.2], (4, 1)))
     moved = np.abs(fine.state().q - coarse.state().q)[:, ACTUATED]
     assert moved.max() < 0.01 and (moved.max() == 0) == (steps == skip)
+
+
+@pytest.mark.parametrize("cranes", [CraneVectorEnv, HydraulicCraneVectorEnv])
+def test_coarser_physics_feels_hits_as_hard(cranes):
+    """The boom drives 32 grapples onto the ground: medians of the largest force, within a fifth."""
+    fine, coarse = (cranes(32, physics_step=p, autoreset=False) for p in (0.0, 0.01))
+    for envs in (fine, coarse):
+        envs.reset(seed=1)
+        for _ in range(40):
+            envs.step(np.tile([0, -0.5, 0, 0, 0, 0], (32, 1)))
+    ratio = np.median(fine.ground_peak) / np.median(coarse.ground_peak)
+    assert 0.8 < ratio < 1.2 and np.median(fine.ground_peak) > GENTLE_FORCE
+    assert CraneVectorEnv(1, contact="sdf", physics_step=0.01).frame_skip == 20  # stays exact
 
 
 WRONG = [
