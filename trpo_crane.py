@@ -204,7 +204,9 @@ def surrogate_and_kl(
 
 
 @torch.no_grad()
-def line_search(agent: Agent, full_step: Tensor, batch: tuple, delta: float, args: Args) -> tuple:
+def line_search(
+    agent: Agent, full_step: Tensor, batch: tuple, delta: float, args: Args
+) -> tuple[float, float, float]:
     """Move the policy along full_step. Returns the accepted fraction, the KL and the improvement.
 
     batch: obs, actions, advantages and old policy, as `surrogate_and_kl` takes them. If no fraction

@@ -30,6 +30,7 @@ matplotlib.use("Agg")
 matplotlib.rcParams["svg.hashsalt"] = "curves"  # the same curves give the same file
 FIGURES = ROOT / "assets" / "figures"
 PAPER = np.mean([*eval_crane.PAPER["none"].values()])  # % of mPPO, Table I
+# Geryyy/crane_model, test/step_response_fixture.json: means over the edges of a recording
 INSTANTS = np.array([0.06, 0.10, 0.15, 0.20, 0.30, 0.45, 0.60, 0.90, 1.20])  # s
 AXES = {  # speed / command that the machine had at INSTANTS; inertia; q2, q3, q4, q8, in the air
     "slew": ([0.01, 0.02, 0.13, 0.33, 0.87, 1.42, 1.33, 0.75, 1.04], 4251, (1.2, -0.5, 0.0, 0.3)),

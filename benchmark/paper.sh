@@ -16,7 +16,8 @@
 # tanh units, normalization, the policy's first width, the LSTM, and TRPO's settings. sb3-contrib
 # takes the mean KL divergence over the six components of the action, we take the sum: its target_kl
 # 0.01 and damping 0.1 are six times as large here. The learning rate falls to 0, and so does the
-# bound of TRPO, and the perturbation of mPPO in the first 40 % of the run. The paper does not say so.
+# bound of TRPO. The perturbation of mPPO falls to 0 in the first 40 % of the run. The paper says
+# none of this.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

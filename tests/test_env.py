@@ -396,7 +396,11 @@ def test_coarser_physics_feels_hits_as_hard(cranes):
             envs.step(np.tile([0, -0.5, 0, 0, 0, 0], (32, 1)))
     ratio = np.median(fine.ground_peak) / np.median(coarse.ground_peak)
     assert 0.8 < ratio < 1.2 and np.median(fine.ground_peak) > GENTLE_FORCE
-    assert CraneVectorEnv(1, contact="sdf", physics_step=0.01).frame_skip == 20  # stays exact
+
+
+def test_sdf_contacts_keep_their_physics_step():
+    envs = CraneVectorEnv(1, contact="sdf", physics_step=0.01)
+    assert envs.frame_skip == 20 and envs.model.opt.timestep == 0.005
 
 
 WRONG = [

@@ -11,6 +11,7 @@ from crane_env import SERVOS, CraneVectorEnv
 from crane_utils.metrics import Metrics
 from hydraulic_crane import HydraulicCraneVectorEnv
 
+# how far the lab's own model of one axis is from its records (assets/README.md, Drives)
 LABS_FIT = {"slew": 0.23, "boom": 0.23, "arm": 0.40, "telescope": 0.79, "rotator": 0.09}
 AREAS = np.array([  # m^3/rad, m^3/m, or m^2 of a cylinder, at -1 and +1
     [12.724e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],

@@ -116,6 +116,14 @@ def test_a_stop_that_gives_under_the_log_ends_nothing(cranes, ends):
     assert envs.rules(state, info)["joint_limit_q4"] == ends
 
 
+def test_the_bed_bears_a_log_that_lies_on_it():
+    envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
+    put(envs, -4.1, 0, 1.4)
+    for _ in range(8):
+        envs.step(IDLE)
+    assert envs.state().carried == pytest.approx(0, abs=0.02)
+
+
 def test_a_crane_that_stands_on_the_log_has_not_let_go():
     envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
     put(envs, -4.1, 0, 1.6, 0.8)
