@@ -433,10 +433,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         info = self.measure(state) | {"time": time, "diverged": diverged}
         reached = self.reached(info) & (time < self.REACH_TIME + 1e-9)
         self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
-        terms = self.checked(self.reward_terms(state, info))
-        terms = {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
-        info |= terms | {"time_to_reach": self.reach_time.copy()}
-        reward = sum(terms.values())
+        info["time_to_reach"] = self.reach_time.copy()
 
         # success: each condition held at every step of the last HOLD_TIME
         holds = self.checked(self.conditions(state, info))
@@ -453,18 +450,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
         gentle = success & (self.ground_peak <= GENTLE_FORCE)
         failure = np.select([~ok for ok in held.values()], [*held], default="")
-        failure = np.where(terminated, ending, failure)
-        failure[~done | success] = ""
-        info |= {"success": success, "is_success": success, "gentle": gentle, "failure": failure}
-        info["termination"] = ending
+        failure = np.where(done & ~success, np.where(terminated, ending, failure), "")
+        ends = {"success": success, "is_success": success, "gentle": gentle, "failure": failure}
+        info |= ends | {"termination": ending}
+
+        # reward
+        terms = self.checked(self.reward_terms(state, info))
+        info |= {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
+        reward = sum(info[name] for name in terms)
+
+        # autoreset
         for i in np.flatnonzero(done):
             self.recent_success[i].append(bool(success[i]))
             if not success[i]:
                 self.failures[i].append(self.starts[i])
-
-        # autoreset
-        at_ends = ("success", "is_success", "gentle", "failure")
-        info |= {f"_{key}": done | (key not in at_ends) for key in info}
+        info |= {f"_{key}": done | (key not in ends) for key in info}
         if self.autoreset and done.any():
             info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
@@ -676,7 +676,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return info["d_combine"] < REACH_DISTANCE
 
     def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """The reward's terms, (N,) each, by name. Their sum is the reward."""
+        """Terms of the reward, their sum, (N,) each, by name. info has `termination`, too."""
         if self.options.reward == "paper":
             return paper_terms(state, info["d_combine"], self.command)
         delta_p, delta_psi, _ = relative_pose(state, self.options.offset)

@@ -195,8 +195,6 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         off = (opened == 1) & (self.on_log == 0)
         lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
         gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
-        holds, last = self.conditions(state, info), self.hold_steps - 1
-        loaded = [ok & (self.streaks.get(name, 0) >= last) for name, ok in holds.items()]
         for name in ("r_distance", "r_grapple", "r_lift"):
             terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
         return terms | {
@@ -207,7 +205,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
             "r_lower": LOWER_WEIGHT * over * held * along * down * (1 + middle) / 2,
             "r_let_go": LET_GO_WEIGHT * low * straight * lets_go,
             "r_release": low * straight * gentle * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
-            "r_loaded": LOADED_PAY * np.all(loaded, axis=0) * gentle,
+            "r_loaded": LOADED_PAY * (info["termination"] == "loaded") * gentle,
         }
 
     def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
