@@ -619,7 +619,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # of all cranes: ideal servos and their integrators answer at every step
         self.ctrl[:, :16] = np.tile(self.command[:, ACTION_OF_SERVO], 2)
 
-    # ---- hooks: what is observed, measured, rewarded, and what ends an episode
+    # ---- hooks: what is observed and measured, what ends an episode, the reward
 
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
@@ -675,24 +675,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """Whether the log is reached now, (N,) bool. `rules` end an episode that is late for it."""
         return info["d_combine"] < REACH_DISTANCE
 
-    def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """Terms of the reward, their sum, (N,) each, by name. info has `termination`, too."""
-        if self.options.reward == "paper":
-            return paper_terms(state, info["d_combine"], self.command)
-        delta_p, delta_psi, _ = relative_pose(state, self.options.offset)
-        distance = np.linalg.norm(delta_p + [0, 0, CLOSING_HEIGHT], axis=-1) + delta_psi
-        clearance, miss = info["clearance"], info["centre_miss"]
-        grasp = self.grasp(state, miss)
-        terms = staged_terms(state, distance, clearance, miss, self.command, *grasp)
-        # An easy task forgives hits: a crane that does not lift yet would learn to stay away.
-        weight = self.GROUND_WEIGHT * self.difficulty**4
-        hardness = np.clip(2 * self.impact / GENTLE_FORCE - 1, 0, self.GROUND_MOST)
-        return terms | {"r_ground": -weight * hardness}
-
-    def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
-        """closed and grip of `staged_terms`."""
-        return state.q[:, 7] / Q8_MAX, centred(miss)
-
     def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """What must hold throughout the last HOLD_TIME, (N,) bool each, named by its failure."""
         return {
@@ -715,6 +697,24 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "log_too_far": away > LOG_RANGE,
             "not_reached": too_late & np.isinf(self.reach_time),
         }
+
+    def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """Terms of the reward, their sum, (N,) each, by name. info has `termination`, too."""
+        if self.options.reward == "paper":
+            return paper_terms(state, info["d_combine"], self.command)
+        delta_p, delta_psi, _ = relative_pose(state, self.options.offset)
+        distance = np.linalg.norm(delta_p + [0, 0, CLOSING_HEIGHT], axis=-1) + delta_psi
+        clearance, miss = info["clearance"], info["centre_miss"]
+        grasp = self.grasp(state, miss)
+        terms = staged_terms(state, distance, clearance, miss, self.command, *grasp)
+        # An easy task forgives hits: a crane that does not lift yet would learn to stay away.
+        weight = self.GROUND_WEIGHT * self.difficulty**4
+        hardness = np.clip(2 * self.impact / GENTLE_FORCE - 1, 0, self.GROUND_MOST)
+        return terms | {"r_ground": -weight * hardness}
+
+    def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
+        """closed and grip of `staged_terms`."""
+        return state.q[:, 7] / Q8_MAX, centred(miss)
 
     # ---- pictures
 

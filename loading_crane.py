@@ -146,7 +146,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         squeeze = self.force_limit[1, ids, 6:] / self.servo_kp[ids, 6:]
         self.act[ids, 6:] = self.qpos[ids, 8:10] + squeeze
 
-    # ---- what is observed, measured and rewarded, and what ends an episode
+    # ---- what is observed and measured, what ends an episode, the reward
 
     def watch_bed(self) -> None:
         """After each physics step: how fast the log meets the bed, where they touch."""
@@ -171,6 +171,27 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         tilt = np.arcsin(np.minimum(np.abs(axis_z), 1))
         place = [cos * x + sin * y, cos * y - sin * x, z]
         return np.column_stack([super().observe(state), *place, angle, tilt])
+
+    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
+        speed += LOG_LENGTH / 2 * np.linalg.norm(self.qvel[:, LOG_TURNING], axis=-1)
+        return {
+            "not_in_bunk": in_bunk(state),
+            "not_along": np.abs(state.log_axis[:, 0]) >= np.cos(MAX_ANGLE),
+            "moving": speed < MAX_SPEED,
+            "not_released": (self.on_log == 0) & (state.q[:, 7] <= OPEN_Q8),
+        }
+
+    def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
+        """not_lifted: LIFT_TIME is over. log_lost: a lifted log is let go beside the bunk."""
+        (x, y, _), lowest = state.log_centre.T, info["clearance"]
+        outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
+        self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
+        dropped = ((self.loose > 0) & (lowest < SETTLED)) | (self.loose >= self.hold_steps)
+        lost = self.lifted & dropped & (outside | (lowest < BED - HIT))
+        ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}
+        self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)
+        return super().rules(state, info) | ends | {"loaded": info["safe"]}
 
     def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
         """Terms of lifting but r_balance, which pays for standing still. Then the stages above."""
@@ -207,27 +228,6 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
             "r_release": low * straight * gentle * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
             "r_loaded": LOADED_PAY * (info["termination"] == "loaded") * gentle,
         }
-
-    def conditions(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        speed = np.linalg.norm(self.qvel[:, LOG_VELOCITY], axis=-1)
-        speed += LOG_LENGTH / 2 * np.linalg.norm(self.qvel[:, LOG_TURNING], axis=-1)
-        return {
-            "not_in_bunk": in_bunk(state),
-            "not_along": np.abs(state.log_axis[:, 0]) >= np.cos(MAX_ANGLE),
-            "moving": speed < MAX_SPEED,
-            "not_released": (self.on_log == 0) & (state.q[:, 7] <= OPEN_Q8),
-        }
-
-    def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """not_lifted: LIFT_TIME is over. log_lost: a lifted log is let go beside the bunk."""
-        (x, y, _), lowest = state.log_centre.T, info["clearance"]
-        outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
-        self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
-        dropped = ((self.loose > 0) & (lowest < SETTLED)) | (self.loose >= self.hold_steps)
-        lost = self.lifted & dropped & (outside | (lowest < BED - HIT))
-        ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}
-        self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)
-        return super().rules(state, info) | ends | {"loaded": info["safe"]}
 
 
 class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):
