@@ -54,14 +54,14 @@ class Args:
     total_timesteps: Count = 1_024_000  # steps of all cranes together, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     threads: Count = 2  # CPU threads of physics and updates
-    eval_every: Count = 25  # updates between evaluations
+    eval_every: Count = 12  # updates between evaluations
     eval_trials: Count = 10  # trials per log diameter in each evaluation
     final_trials: Count = 100  # the same after the last update
     resume: Path | None = None  # run's folder to continue, perhaps with more total_timesteps
 
     # task
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
-    num_envs: Count = 64  # cranes simulated side by side
+    num_envs: Count = 128  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
     physics_step: Factor = 0.01  # s, in training; 0, as in evaluations, is the task's own 0.005
 
@@ -72,9 +72,9 @@ class Args:
     gamma: Share = 0.97  # discount per step at the start
     gae_lambda: Share = 0.95  # lambda of the advantage estimate, per step
     reward_scale: Factor = 0.06  # factor on the reward; falls as the horizon grows
-    minibatch_size: Count = 1024  # steps per gradient step of the critic
+    minibatch_size: Count = 2048  # steps per gradient step of the critic
     update_epochs: Count = 4  # passes of the critic over each rollout
-    target_kl: Factor = 0.04  # delta at the start, bound of the mean KL divergence of one step
+    target_kl: Factor = 0.06  # delta at the start, bound of the mean KL divergence of one step
     cg_iters: Count = 15  # iterations of the conjugate gradient
     cg_damping: Factor = 0.1  # d, added to the diagonal of F
     fisher_samples: Count = 1024  # steps of each rollout whose F gives the step's direction

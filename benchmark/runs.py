@@ -54,14 +54,13 @@ LABELS = {  # of the scripts, in figures and tables
 # ---- all trainings. Seeds 1 ... 20 are for tuning, those below for reports
 
 MPPO, PPO, TRPO, RECURRENT = LABELS
-HYDRAULIC = f"--env-id {LEVELS['hydraulic']} --total-timesteps 1536000 --num-envs 128 "
-HYDRAULIC += "--curriculum 0.6 "
+HYDRAULIC = f"--env-id {LEVELS['hydraulic']} --total-timesteps 2560000 --num-envs 128 "
 RANDOMIZED = f"--env-id {LEVELS['randomized']} --total-timesteps 4096000 --num-envs 128 "
 RANDOMIZED += "--curriculum 0.25 "
 OWN = {  # flags of the scripts on both harder levels
     MPPO: "--learning-rate 1e-3",
     PPO: "",
-    TRPO: "--fisher-samples 2048 --cg-iters 5 --retry 0.5",
+    TRPO: "--minibatch-size 1024 --target-kl 0.04 --fisher-samples 2048 --cg-iters 5 --retry 0.5",
     RECURRENT: "--learning-rate 7e-4 --retry 0.5",
 }
 HARD = {
