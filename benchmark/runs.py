@@ -67,9 +67,9 @@ HARD = {
     level: {script: flags + own for script, own in OWN.items()}
     for level, flags in (("hydraulic", HYDRAULIC), ("randomized", RANDOMIZED))
 }
-CYCLE = f"--env-id {LOADING['ideal']} --total-timesteps 6144000 --learning-rate 1e-3 "
-CYCLE += "--curriculum 0.25 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
-CYCLE += "--eval-every 150"
+CYCLE = "--total-timesteps 8192000 --num-envs 128 --minibatch-size 2048 --learning-rate 1e-3 "
+CYCLE += "--curriculum 0.3 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
+CYCLE += "--eval-every 100 --env-id "
 PRINTED = "--total-timesteps 25000000 --eval-every 200 --env.reward paper --env.offset minus "
 PRINTED += "--env.signed-yaw False --env.axes world"  # 500 million physics steps, as in the paper
 ABLATIONS = {  # what it is in the figure, script and flags
@@ -99,7 +99,8 @@ TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
     *[("levels", f"{script}_{level}", script, flags, FIVE if level == "hydraulic" else THREE)
       for level in HARD for script, flags in HARD[level].items()],
-    ("loading", f"{MPPO}_ideal", MPPO, CYCLE, THREE),
+    *[("loading", f"{MPPO}_{level}", MPPO, CYCLE + env_id, THREE)
+      for level, env_id in LOADING.items()],
     ("printed", MPPO, MPPO, PRINTED, (21,)),
     ("short", MPPO, MPPO, "--total-timesteps 512000 --eval-every 8", THREE),
     *[("ablations", name, script, SHORT + flags, THREE)
