@@ -57,8 +57,9 @@ KEPT = ["success", "gentle", "failure", "ground_peak", *(key for _, key, _, _ in
 
 @dataclass(config=STRICT)
 class Args:
-    policies: Annotated[tuple[str, ...], tyro.conf.Positional] = (SHIPPED,)
-    """run's folders or policy.pt files; scripted, zero or random; my_module:MyPolicy"""
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """run's folders or policy.pt files; scripted, zero or random; my_module:MyPolicy; none: the
+    shipped mPPO policy"""
     env_id: str | None = None
     """task to evaluate on; unset: the one the policy was trained on, or ForestryCrane-v0"""
     trials: Annotated[int, Field(ge=1)] = 100
@@ -237,7 +238,7 @@ def main() -> None:
         raise SystemExit("--csv has a row for each evaluated trial: leave out --video and --viewer")
     torch.set_num_threads(1)  # the batches are too small for more
     evaluated = []
-    for name in args.policies:  # all errors before the first trial
+    for name in args.policies or (SHIPPED,):  # all errors before the first trial
         try:
             policy, trained, label = load_policy(name, args.env_id)
             evaluated.append((name, label, policy, *task_of(policy, trained, args, flags)))

@@ -228,10 +228,12 @@ def leaderboard() -> str:
     for (level, method), rows in of_method.items():
         scores = ("gentle_exact", "success_exact", "gentle_pose_errors", "success_pose_errors")
         means = [f"{np.mean(numbers(rows, score)):.1f}" for score in scores]
-        lines.append([level, method, *means, str(len(rows)), rows[0]["training"]])
+        revision, training = rows[0]["revision"], rows[0]["training"]
+        lines.append([level, method, *means, str(len(rows)), revision, training])
     lines.sort(key=lambda line: ([*LEVELS].index(line[0]), -float(line[2])))
     header = ["level", "method", "gentle %", "success %", "gentle, with pose errors"]
-    return table([*header, "success, with pose errors", "number of seeds", "training"], lines)
+    header += ["success, with pose errors", "number of seeds", "revision", "training"]
+    return table(header, lines)
 
 
 def held() -> str:

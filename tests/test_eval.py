@@ -366,9 +366,12 @@ def test_shipped_policies_are_of_the_registered_tasks(path):
 
 
 def test_the_shipped_policy_lifts_logs(judge):
-    line = "--json --trials 3 --diameters 0.4 0.5 0.6 --seed 77"
+    line = "--json --trials 3 --diameters 0.4 0.5 0.6 --seed 77 --env.pose-noise step"
     answer = json.loads(judge(line).out)
     assert answer["policy"] == SHIPPED and answer["table"]["all"]["success %"] > 80
+    assert answer["options"]["pose_noise"] == "step"
+    with pytest.raises(SystemExit):
+        judge("--tirals 3")
 
 
 def test_acting_loads_neither_tensorboard_nor_distributed():
