@@ -151,7 +151,9 @@ def task_of(policy: Any, trained: dict, args: Args, flags: list[str]) -> tuple[s
         for name, value in trained.get("options", {}).items()
         if value != getattr(options, name, None)
     }
-    if trained.get("revision", cranes.REVISION) != cranes.REVISION:
+    if trained.get("env_id", env_id) != env_id:
+        differs["the task"] = f"{trained['env_id']}, not {env_id}"
+    elif trained.get("revision", cranes.REVISION) != cranes.REVISION:
         differs["revision"] = f"{trained['revision']}, not {cranes.REVISION}"
     for name, values in differs.items():
         print(f"the policy was made for {name} {values}", file=sys.stderr)

@@ -223,7 +223,8 @@ def leaderboard() -> str:
     """leaderboard.csv: means over the seeds of each method, level by level, the best first."""
     of_method = defaultdict(list)
     for row in read_rows(RESULTS / "leaderboard.csv"):
-        of_method[row["level"], row["method"]].append(row)
+        if row["success_exact"]:
+            of_method[row["level"], row["method"]].append(row)
     lines = []
     for (level, method), rows in of_method.items():
         scores = ("gentle_exact", "success_exact", "gentle_pose_errors", "success_pose_errors")

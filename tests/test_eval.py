@@ -268,7 +268,7 @@ def test_a_film_is_of_the_trial_that_was_asked_for(judge, monkeypatch, trained):
 # ---- policies
 
 
-def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained):
+def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained, monkeypatch):
     line = f"{trained} --trials 1 --diameters 0.6"
     asked = judge(line)
     assert f"on {QUICK}, axes=world, seed" in asked.out and not asked.err.count("made for")
@@ -279,7 +279,9 @@ def test_a_policy_is_judged_on_the_task_of_its_training(judge, trained):
     asked = judge(line, "--env-id ForestryCrane-v0")  # as it is registered
     assert "on ForestryCrane-v0, seed" in asked.out
     assert "the policy was made for axes 'world', not 'crane'" in asked.err
-    assert "the policy was made for revision 3, not 7" in asked.err
+    assert f"the policy was made for the task {QUICK}, not ForestryCrane-v0" in asked.err
+    monkeypatch.setattr(toy_tasks.Quick, "REVISION", 4)
+    assert "the policy was made for revision 3, not 4" in judge(line).err
     flags = ("--json", "--json --env.axes crane")
     tables = [json.loads(judge(line, flag).out)["table"] for flag in flags]
     assert tables[0] != tables[1]
