@@ -58,7 +58,7 @@ HYDRAULIC = f"--env-id {LEVELS['hydraulic']} --total-timesteps 2560000 --num-env
 RANDOMIZED = f"--env-id {LEVELS['randomized']} --total-timesteps 4096000 --num-envs 128 "
 RANDOMIZED += "--curriculum 0.25 "
 OWN = {  # flags of the scripts on both harder levels
-    MPPO: "--learning-rate 1e-3",
+    MPPO: "",
     PPO: "",
     TRPO: "--minibatch-size 1024 --target-kl 0.04 --fisher-samples 2048 --cg-iters 5 --retry 0.5",
     RECURRENT: "--learning-rate 7e-4 --retry 0.5",
@@ -67,6 +67,8 @@ HARD = {
     level: {script: flags + own for script, own in OWN.items()}
     for level, flags in (("hydraulic", HYDRAULIC), ("randomized", RANDOMIZED))
 }
+HARD["hydraulic"][MPPO] += "--learning-rate 1e-3"
+HARD["randomized"][MPPO] += "--learning-rate 7e-4 --minibatch-size 2048 --update-epochs 8"
 CYCLE = "--total-timesteps 8192000 --num-envs 128 --minibatch-size 2048 --learning-rate 1e-3 "
 CYCLE += "--curriculum 0.3 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
 CYCLE += "--eval-every 100 --env-id "
