@@ -237,6 +237,29 @@ def leaderboard() -> str:
     return table(header, lines)
 
 
+def rivals() -> str:
+    """rivals.csv: success after the last minute, with our settings and with published ones."""
+    names = {"mppo_beta": "our mPPO", "rsl_rl_ppo": "PPO of rsl-rl", "skrl_ppo": "PPO of skrl"}
+    names |= {"sb3_ppo": "PPO of Stable-Baselines3", "sac": "SAC of Stable-Baselines3"}
+    names |= {"tqc": "TQC of sb3-contrib", "sbx_ppo": "PPO of sbx", "sbx_sac": "SAC of sbx"}
+    names |= {"cleanrl_ppo": "PPO of CleanRL"}
+    ends: dict[tuple[str, str], dict] = defaultdict(dict)  # the last row of each seed
+    for row in read_rows(RESULTS / "rivals.csv"):  # by minutes
+        ends[row["rival"], row["setting"]][row["seed"]] = row
+    ends["mppo_beta", "ours"] = ends.pop(("mppo_beta", "published"))
+    lines = []
+    for rival, name in names.items():
+        steps = np.mean(numbers([*ends[rival, "ours"].values()], "steps")) / 1e6
+        means, cells = [], []
+        for setting in ("ours", "published"):
+            if success := numbers([*ends[rival, setting].values()], "success"):
+                means.append(np.mean(success))
+                cells.append(f"{means[-1]:.1f} ({min(success):.1f}–{max(success):.1f})")
+        lines.append((-means[0], [name, f"{steps:.2f}", *cells, *[""] * (2 - len(cells))]))
+    header = ["method", "steps [million]", "success, our settings", "success, published settings"]
+    return table(header, [line for _, line in sorted(lines)])
+
+
 def held() -> str:
     """held.csv: success after 9 s / after ten more seconds without command."""
     of = {(r["method"], r["level"]): r for r in read_rows(RESULTS / "held.csv")}
@@ -248,7 +271,7 @@ def held() -> str:
 
 
 ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, ablations, robustness)
-ALL += (speed, leaderboard)
+ALL += (speed, leaderboard, rivals)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 
