@@ -57,7 +57,7 @@ MPPO, PPO, TRPO, RECURRENT = LABELS
 HYDRAULIC = f"--env-id {LEVELS['hydraulic']} --total-timesteps 2560000 --num-envs 128 "
 RANDOMIZED = f"--env-id {LEVELS['randomized']} --total-timesteps 4096000 --num-envs 128 "
 RANDOMIZED += "--curriculum 0.25 "
-OWN = {  # flags of the scripts on both harder levels
+OWN = {  # flags of the scripts on both harder levels; mPPO's differ
     MPPO: "",
     PPO: "",
     TRPO: "--minibatch-size 1024 --target-kl 0.04 --fisher-samples 2048 --cg-iters 5 --retry 0.5",
