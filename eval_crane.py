@@ -259,15 +259,13 @@ def main() -> None:
             continue
         rows = []
         for row in play(policy, env_id, options, args):
+            rows.append({"policy": name, "env_id": env_id, **row})
             if file and not file.tell():
-                csv.DictWriter(file, ["policy", *row]).writeheader()
+                csv.DictWriter(file, rows[-1]).writeheader()
             if file:
-                csv.DictWriter(file, ["policy", *row]).writerow({"policy": name, **row})
-            rows.append(row)
-        papers_task = env_id.rpartition(":")[2].partition("-")[0] in (
-            "ForestryCrane",
-            "ForestryCranePaper",
-        )
+                csv.DictWriter(file, rows[-1]).writerow(rows[-1])
+        task = env_id.rpartition(":")[2].partition("-")[0]
+        papers_task = task in ("ForestryCrane", "ForestryCranePaper")
         published = PAPER.get(options.pose_noise, {}) if papers_task else {}
         table = {
             f"{d} m": summarize([row for row in rows if row["diameter"] == d], published)
@@ -276,11 +274,8 @@ def main() -> None:
         table["all"] = overall[f"{label} ({name})"] = summarize(rows, published)
         if args.json:
             answer = {"policy": name, "env_id": env_id, "options": asdict(options)}
-            answer |= {
-                "seed": args.seed,
-                "table": table,
-                "revision": trials.crane_class(env_id).REVISION,
-            }
+            answer |= {"revision": trials.crane_class(env_id).REVISION, "seed": args.seed}
+            answer["table"] = table
             answer["versions"] = {package: version(package) for package in ("mujoco", "torch")}
             print(json.dumps(answer), flush=True)
             continue

@@ -174,7 +174,7 @@ def test_table_csv_and_json(judge, tmp_path):
     with open(tmp_path / "trials.csv", encoding="utf-8") as file:
         rows = [*csv.DictReader(file)]
     assert [row["trial"] for row in rows] == ["0", "1", "2", "3"] * 4
-    assert {row["policy"] for row in rows} == {"scripted"}
+    assert {(row["policy"], row["env_id"]) for row in rows} == {("scripted", QUICK)}
     assert [row["failure"] for row in rows] == ["thinnest"] * 4 + ["thin"] * 4 + [""] * 8
     assert [row["gentle"] for row in rows] == ["False"] * 8 + ["True"] * 4 + ["False"] * 4
     wins = [row for row in rows if row["success"] == "True"]
