@@ -72,7 +72,7 @@ def panels(columns: dict[str, tuple], rows: dict[str, str], path: Path) -> None:
             axis.grid(alpha=0.3)
             axes[row, 0].set_ylabel(f"{name} of the mean action")
         axis.set_xlabel(below)
-        axes[0, column].legend(fontsize=8)
+        axes[0, column].legend(fontsize=8, loc="lower right")
     save(figure, path)
 
 
@@ -127,7 +127,7 @@ def levels() -> None:
         for x, success in enumerate(of.values()):
             axis.plot([x] * len(success), success, "o", color=f"C{x}", alpha=0.7)
             axis.hlines(np.mean(success), x - 0.3, x + 0.3, color=f"C{x}", linewidth=2)
-        axis.set_xticks(range(len(of)), [label.replace(" ", "\n") for label in of])
+        axis.set_xticks(range(len(of)), [label.replace(" ", "\n") for label in of], fontsize=8)
         axis.set_title(f"{level} level")
         axis.grid(axis="y", alpha=0.3)
     label = "paper, Table I: another rule, 500 M steps"

@@ -165,19 +165,36 @@ def costs() -> str:
 
 
 def timed() -> str:
-    """timed/: trainings alone on two cores. A success that is kept never falls below 95 % again."""
-    lines, curves = [], read_curves("timed")
+    """curves/ and levels/: minutes of mPPO alone on two cores, without evaluations."""
+    lines, curves = [], read_curves("curves") | read_curves("levels")
     for level in LEVELS:
-        name = "mppo_beta_crane" + f"_{level}" * (level != "ideal")
-        for seed, run in curves.get(name, {}).items():
+        name = runs.MPPO if level == "ideal" else f"{runs.MPPO}_{level}"
+        alone = [run.seed for run in runs.RUNS if run.alone and run.name == name]
+        of_seed = {seed: run for seed, run in curves.get(name, {}).items() if seed in alone}
+        if not of_seed:
+            continue
+        whole, kept = [], []
+        for run in of_seed.values():
             success, minutes = run["eval_success_rate"], run["minutes"]
             good = [k for k in range(len(success) - 1) if success[k:].min() >= 0.95]
-            kept = next((minutes[k] for k in good if success[k] >= 0.963), np.nan)
-            cells = [joined([x], 1) for x in (minutes[-1], kept)]
-            cells = [f"{run['steps'][-1] / 1e6:.2f}", *cells, f"{100 * success[-1]:.1f}"]
-            lines.append([level, str(seed), *cells])
-    header = ["level", "seed", "steps [million]", "training [min]", "96.3 % kept after [min]"]
-    return table([*header, "success at the end [%]"], lines)
+            whole.append(minutes[-1])
+            kept.append(next((minutes[k] for k in good if success[k] >= 0.963), np.nan))
+        steps = f"{run['steps'][-1] / 1e6:.2f}"
+        middle = f"{np.median(whole):.1f} ({min(whole):.1f}–{max(whole):.1f})"
+        lines.append([level, ", ".join(map(str, of_seed)), steps, middle, joined(kept, 1)])
+    header = ["level", "seeds", "steps [million]", "training [min]", "96.3 % kept after [min]"]
+    return table(header, lines)
+
+
+def printed() -> str:
+    """printed/: mPPO with the printed reward and observation, at the paper's own budget."""
+    lines, million = [], [5, 10, 15, 20, 25]
+    for seed, run in read_curves("printed").get(runs.MPPO, {}).items():
+        for name in ("success_rate", "gentle_rate", "episodic_return"):
+            scale = 1 if name == "episodic_return" else 100
+            row = np.interp(np.multiply(million, 1e6), run["steps"], scale * run[f"eval_{name}"])
+            lines.append([name.replace("_", " "), str(seed), *(f"{x:.1f}" for x in row)])
+    return table(["evaluation", "seed", *(f"{steps} million" for steps in million)], lines)
 
 
 def ablations() -> str:
@@ -270,8 +287,8 @@ def held() -> str:
     return table(["policy", *LEVELS], lines)
 
 
-ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, ablations, robustness)
-ALL += (speed, leaderboard, rivals)
+ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, printed, ablations)
+ALL += (robustness, speed, leaderboard, rivals)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 
