@@ -80,7 +80,7 @@ class Args:
 
     # schedules (docs/training.md)
     curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
-    retry: Share = 0.0  # largest share of episodes that repeat a failed start
+    retry: Share = 0.5  # largest share of episodes that repeat a failed start
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
     narrowing: float = 1.25  # fall of log sigma in the run
 

@@ -61,7 +61,7 @@ OWN = {  # flags of the scripts on both harder levels; mPPO's differ
     MPPO: "",
     PPO: "",
     TRPO: "--minibatch-size 1024 --target-kl 0.04 --fisher-samples 2048 --cg-iters 5 --retry 0.5",
-    RECURRENT: "--learning-rate 7e-4 --retry 0.5",
+    RECURRENT: "--learning-rate 7e-4",
 }
 HARD = {
     level: {script: flags + own for script, own in OWN.items()}
