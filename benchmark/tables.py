@@ -180,7 +180,9 @@ def timed() -> str:
             whole.append(minutes[-1])
             kept.append(next((minutes[k] for k in good if success[k] >= 0.963), np.nan))
         steps = f"{run['steps'][-1] / 1e6:.2f}"
-        middle = f"{np.median(whole):.1f} ({min(whole):.1f}–{max(whole):.1f})"
+        middle = f"{np.median(whole):.1f}"
+        if len(whole) > 1:
+            middle += f" ({min(whole):.1f}–{max(whole):.1f})"
         lines.append([level, ", ".join(map(str, of_seed)), steps, middle, joined(kept, 1)])
     header = ["level", "seeds", "steps [million]", "training [min]", "96.3 % kept after [min]"]
     return table(header, lines)
