@@ -539,11 +539,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if share and failures and start_rng.random() < share:
             self.starts[i] = failures[start_rng.integers(len(failures))]
         else:
-            self.starts[i] = sample_start(start_rng)
+            self.starts[i] = *sample_start(start_rng), {}  # for what a subclass draws with it
         self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
         if self.difficulty < 1:
-            return ease_start(*self.starts[i], self.difficulty)
-        return self.starts[i]
+            return ease_start(*self.starts[i][:3], self.difficulty)
+        return self.starts[i][:3]
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""

@@ -125,11 +125,8 @@ def grip_depth(state: CraneState) -> Array:
 
     Jaws that pinch a log above its centre squeeze it out.
     """
-    tips = (
-        state.grapple_centre[:, 2]
-        + crane_env.PIVOT_HEIGHT
-        - crane_env.JAW_LENGTH * np.sin(state.q[:, 7])
-    )
+    pivots = state.grapple_centre[:, 2] + crane_env.PIVOT_HEIGHT
+    tips = pivots - crane_env.JAW_LENGTH * np.sin(state.q[:, 7])
     return (state.log_centre[:, 2] - tips) / (state.diameter / 2)
 
 
@@ -145,6 +142,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         super().__init__(num_envs, **kwargs)
+        self.GROUND_WEIGHT /= 1 + self.options.randomize  # with pose errors, care grips too high
         names = ["actuator_gainprm", "actuator_biasprm", "actuator_delay", "actuator_forcerange"]
         names += ["dof_damping", "geom_friction"]
         self.engine = {name: self.batch.expand(name) for name in names}
@@ -181,6 +179,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
                     drawn = np.exp(rng.uniform(np.log(low), np.log(high)))
                 else:
                     drawn = rng.uniform(low, high)
+                drawn = self.starts[i][3].setdefault(name, drawn)  # a repeated start's machine
                 self.drawn[name][i] = nominal + self.options.randomize * (drawn - nominal)
         swing = np.zeros(8)
         swing[PASSIVE] = self.drawn["swing"][i]
@@ -286,12 +285,13 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
     def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
         """Soft drives lose what stiff servos hold, so only a grip earns all of r_grapple.
 
-        It lifts in full where the tips are half a radius below the log's centre or deeper.
+        It lifts in full where the tips are half a radius below the log's centre or deeper, and pays
+        less above: the more so with randomize, whose logs may be slippery.
         """
         closed, grip = super().grasp(state, miss)
-        held = state.touching.all(axis=-1)
-        closed = np.where(held, 1.0, np.minimum(closed, EMPTY_GRIP))
-        return closed, grip * np.clip(0.5 + grip_depth(state), 0, 1)
+        closed = np.where(state.touching.all(axis=-1), 1.0, np.minimum(closed, EMPTY_GRIP))
+        depth = grip_depth(state)
+        return closed, grip * np.clip(0.5 + depth + self.options.randomize * (depth - 0.5), 0, 1)
 
 
 class HydraulicCraneEnv(crane_env.CraneEnv):

@@ -132,7 +132,8 @@ class ReferenceCrane:
         share = self.retry * (sum(self.successes) / len(self.successes) if self.successes else 0)
         self.repeated = bool(share and self.failed_starts and self.start_rng.random() < share)
         if self.repeated:
-            self.drawn_start = self.failed_starts[self.start_rng.integers(len(self.failed_starts))]
+            chosen = self.start_rng.integers(len(self.failed_starts))
+            self.drawn_start, machine = self.failed_starts[chosen]
         else:
             self.drawn_start = sample_start(self.start_rng)
         steps = -int(-(self.time_limit / self.dt - 1e-9) // 1)
@@ -146,6 +147,7 @@ class ReferenceCrane:
             else:
                 drawn = [uniform(a, b) for a, b in zip(low, high)]
             self.drawn[name] = [n + share * (x - n) for n, x in zip(nominal, drawn)]
+        self.drawn = machine if self.repeated else self.drawn
         self.steps, self.reached_at, self.command = 0, inf, [0.0] * 6
         self.peak, self.valve_speed, self.telescope_wait = 0.0, [0.0] * 6, 0.0
         self.kept, self.limits = {}, [[f, f] for f in FORCE_LIMIT]
@@ -399,7 +401,7 @@ class ReferenceCrane:
             info["failure"] = "" if success else failed[0] if ending == "time_limit" else ending
             self.successes.append(success)
             if not success:
-                self.failed_starts.append(self.drawn_start)
+                self.failed_starts.append((self.drawn_start, self.drawn))
         return sum(terms.values()), info
 
     def staged(self, info, held):
@@ -411,8 +413,10 @@ class ReferenceCrane:
         if self.hydraulic:
             tips = self.data.site_xpos[self.site][2] + 0.5 - 0.8566 * sin(q8)
             depth = (self.log_pose()[0][2] - tips) / (self.diameter / 2)
-            grip, closed = grip * clip(0.5 + depth, 0, 1), 1 if held else min(closed, 0.5)
-            most, weight = 3, 90
+            randomize = self.options.get("randomize", 0.0)
+            pay = clip(1 + (1 + randomize) * (depth - 0.5), 0, 1)
+            grip, closed = grip * pay, 1 if held else min(closed, 0.5)
+            most, weight = 3, 90 / (1 + randomize)
         lift = grip * sqrt(min(clear, 1 / clear))
         return {
             "r_distance": exp(-far),
