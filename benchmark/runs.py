@@ -68,7 +68,9 @@ HARD = {
     for level, flags in (("hydraulic", HYDRAULIC), ("randomized", RANDOMIZED))
 }
 HARD["hydraulic"][MPPO] += "--learning-rate 1e-3"
-HARD["randomized"][MPPO] += "--learning-rate 7e-4 --minibatch-size 2048 --update-epochs 8"
+HARD["randomized"][MPPO] = f"--env-id {LEVELS['randomized']} --total-timesteps 7372800 "
+HARD["randomized"][MPPO] += "--num-envs 256 --curriculum 0.2 --learning-rate 7e-4 "
+HARD["randomized"][MPPO] += "--minibatch-size 2048"
 CYCLE = "--total-timesteps 8192000 --num-envs 128 --minibatch-size 2048 --learning-rate 1e-3 "
 CYCLE += "--curriculum 0.3 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
 CYCLE += "--eval-every 100 --env-id "
