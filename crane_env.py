@@ -390,8 +390,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.steps = np.zeros(num_envs, int)  # since the start of each episode
         self.reach_time = np.full(num_envs, np.inf)  # s
         self.streaks: dict[str, Array] = {}  # for how many steps each of `conditions` has held
-        # N, largest force of the crane on the ground in the last step, and in the episode
-        self.impact, self.ground_peak = np.zeros((2, num_envs))
+        self.impact, self.ground_peak = np.zeros((2, num_envs))  # N, on ground: step, episode
         draws = self.max_steps + 1 if self.options.pose_noise == "step" else 1
         self.noise = np.zeros((num_envs, draws, 2))  # epsilon_p, epsilon_o
 
@@ -749,7 +748,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
 
 class CraneEnv(gymnasium.Env):
-    """One crane of `cranes`: a view of `CraneVectorEnv`, for reading, check_env and wrappers.
+    """One crane of `cranes`. A new `difficulty` counts from the next reset.
 
     A task of your own has one crane too: class MyCraneEnv(CraneEnv): cranes = MyCranes.
     """
@@ -760,12 +759,13 @@ class CraneEnv(gymnasium.Env):
     def __init__(self, **kwargs: Any):
         self.envs = self.cranes(num_envs=1, autoreset=False, **{"env_threads": 1, **kwargs})
         self.metadata = {**self.metadata, "render_fps": self.envs.metadata["render_fps"]}
-        self.render_mode = self.envs.render_mode
+        self.render_mode, self.difficulty = self.envs.render_mode, self.envs.difficulty
         self.observation_space = self.envs.single_observation_space
         self.action_space = self.envs.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
+        self.envs.difficulty = self.difficulty
         obs, info = self.envs.reset(seed=seed)
         return obs[0], self.first_crane(info)
 

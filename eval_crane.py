@@ -238,6 +238,8 @@ def main() -> None:
     )
     if args.csv and (args.video or args.viewer):
         raise SystemExit("--csv has a row for each evaluated trial: leave out --video and --viewer")
+    if args.video and len(args.policies) > 1:
+        raise SystemExit("--video films one policy")
     torch.set_num_threads(1)  # the batches are too small for more
     evaluated = []
     for name in args.policies or (SHIPPED,):  # all errors before the first trial

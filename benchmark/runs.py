@@ -33,6 +33,7 @@ from pydantic.dataclasses import dataclass
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
+from crane_utils.runs import load
 from crane_utils.trials import REPORT_SEED
 
 HERE = Path(__file__).parent
@@ -217,21 +218,23 @@ def make(run: Run, here: Path, quick: bool) -> str:
     label, threads = f"{run.folder}_{run.name}", "2" if run.alone else "1"
     folders = f"runs/*__{label}__{run.seed}__*"
     command = [sys.executable, str(ROOT / f"{run.script}.py"), "--threads", threads]
+    trained = False  # trained before, but not evaluated
     if begun := sorted(here.glob(f"{folders}/checkpoint.pt")):
         command += ["--resume", str(begun[-1].parent)]
+        checkpoint = load(begun[-1])
+        args, after = checkpoint["args"], checkpoint["iteration"] + 1
+        trained = args["total_timesteps"] < after * args["num_envs"] * args["num_steps"]
     else:
         command += ["--exp-name", label, "--seed", str(run.seed), *run.flags.split()]
         command += QUICK.split() if quick else []
     log = here / f"{label}_seed{run.seed}.log"
     tqdm.write(f"{'resumed' if begun else 'started'}: {run}, see {log}")
     with open(log, "a", encoding="utf-8") as file:
-        if subprocess.run(command, cwd=here, stdout=file, stderr=file).returncode:
+        if not trained and subprocess.run(command, cwd=here, stdout=file, stderr=file).returncode:
             return f"stopped: {run}, see {log}"
     log.unlink()
     folder, results, evaluated = max(here.glob(folders)), here / "results", []
     rows = export(folder)
-    if rows[-1]["eval_episodic_return"] == "":
-        return f"stopped: {run} was killed in its last evaluation, delete {folder}"
     if run.folder in ("curves", "levels", "loading", "short"):
         for noise in ("none", "step"):
             key = {"run": label, "seed": run.seed, "pose_noise": noise, "trial_seed": REPORT_SEED}

@@ -243,12 +243,12 @@ def leaderboard() -> str:
     of_method = defaultdict(list)
     for row in read_rows(RESULTS / "leaderboard.csv"):
         if row["success_exact"]:
-            of_method[row["level"], row["method"]].append(row)
+            key = (row["level"], row["method"], row["revision"], row["training"])
+            of_method[key].append(row)
     lines = []
-    for (level, method), rows in of_method.items():
+    for (level, method, revision, training), rows in of_method.items():
         scores = ("gentle_exact", "success_exact", "gentle_pose_errors", "success_pose_errors")
         means = [f"{np.mean(numbers(rows, score)):.1f}" for score in scores]
-        revision, training = rows[0]["revision"], rows[0]["training"]
         lines.append([level, method, *means, str(len(rows)), revision, training])
     lines.sort(key=lambda line: ([*LEVELS].index(line[0]), -float(line[2])))
     header = ["level", "method", "gentle %", "success %", "gentle, with pose errors"]

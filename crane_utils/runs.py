@@ -62,9 +62,13 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     if checkpoint:
-        for name in ("env_id", "num_envs", "num_steps", "hidden_sizes"):  # all that rests on them
-            if getattr(args, name) != (was := getattr(default, name)):
+        # all that rests on them
+        for name in ("env_id", "num_envs", "num_steps", "hidden_sizes", "lstm_size"):
+            if getattr(args, name, None) != (was := getattr(default, name, None)):
                 raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
+        cranes, was = trials.crane_class(args.env_id), checkpoint["task"].get("revision")
+        if cranes and cranes.REVISION != was:
+            raise SystemExit(f"--resume: the task has revision {cranes.REVISION}, the run {was}")
         batch_size = args.num_envs * args.num_steps
         done = checkpoint["iteration"] * batch_size
         if args.total_timesteps < done + batch_size:
@@ -154,6 +158,8 @@ class StopSignal:
         self.received = number
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+        elif number != signal.SIGTERM:  # the terminal is closed: writing to it would fail
+            sys.stdout = open(os.devnull, "w", encoding="utf-8")
 
 
 def brief(numbers: dict[str, float]) -> str:

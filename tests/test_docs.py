@@ -100,7 +100,7 @@ def test_code_runs(page, tmp_path, monkeypatch, capsys):
             compile(code, name(page), "exec")  # part of a file
             continue
         module = f"page_{page.stem}_{number}"
-        for whole, short in [("1_000_000", "256"), ("(64)", "(4)"), ("verbose=1", "verbose=0")]:
+        for whole, short in [("1_000_000", "256"), ("Env(64", "Env(4"), ("verbose=1", "verbose=0")]:
             code = code.replace(whole, short)
         (tmp_path / f"{module}.py").write_text(code, encoding="utf-8")
         left = runpy.run_path(f"{module}.py")
