@@ -95,6 +95,14 @@ def test_seeds():
     assert not envs.recent_success[0] and not envs.failures[0]
 
 
+def test_difficulty_of_single_cranes():
+    """From the next reset on. At 0 the log has the grapple's yaw."""
+    envs = gymnasium.vector.SyncVectorEnv([CraneEnv] * 3)
+    assert np.abs(envs.reset(seed=0)[0][:, 17]).max() > 0.5
+    envs.set_attr("difficulty", 0.0)
+    np.testing.assert_allclose(envs.reset(seed=0)[0][:, 17], 0, atol=0.06)  # q5 and q6 swing
+
+
 def test_one_crane_is_a_view_of_many():
     """The same numbers in Python's own types, also at the end; and no autoreset."""
     kwargs = {"difficulty": 0.5, "randomize": 1.0}

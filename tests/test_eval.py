@@ -304,6 +304,13 @@ def test_a_run_is_built_by_the_script_that_made_it(trained, tmp_path):
         runs.load_policy(other)
 
 
+def test_a_run_of_another_revision_is_not_resumed(trained, monkeypatch):
+    monkeypatch.setattr(toy_tasks.Quick, "REVISION", 99)
+    monkeypatch.setattr(sys, "argv", ["ppo_crane.py", "--resume", str(trained)])
+    with pytest.raises(SystemExit, match="^--resume: the task has revision 99, the run 3$"):
+        runs.parse(importlib.import_module("ppo_crane").Args, "")
+
+
 class Harmful:
     def __reduce__(self):
         return print, ("code ran",)
