@@ -538,7 +538,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if share and failures and start_rng.random() < share:
             self.starts[i] = failures[start_rng.integers(len(failures))]
         else:
-            self.starts[i] = *sample_start(start_rng), {}  # for what a subclass draws with it
+            self.starts[i] = *sample_start(start_rng), {}  # {}: what a subclass draws with it
         self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
         if self.difficulty < 1:
             return ease_start(*self.starts[i][:3], self.difficulty)
@@ -748,7 +748,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
 
 class CraneEnv(gymnasium.Env):
-    """One crane of `cranes`. A new `difficulty` counts from the next reset.
+    """One crane of `cranes`, a `CraneVectorEnv`. A new `difficulty` counts from the next reset.
 
     A task of your own has one crane too: class MyCraneEnv(CraneEnv): cranes = MyCranes.
     """

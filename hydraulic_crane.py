@@ -142,7 +142,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
         super().__init__(num_envs, **kwargs)
-        self.GROUND_WEIGHT /= 1 + self.options.randomize  # with pose errors, care grips too high
+        self.GROUND_WEIGHT /= 1 + self.options.randomize  # a more careful crane grips too high
         names = ["actuator_gainprm", "actuator_biasprm", "actuator_delay", "actuator_forcerange"]
         names += ["dof_damping", "geom_friction"]
         self.engine = {name: self.batch.expand(name) for name in names}

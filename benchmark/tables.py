@@ -53,6 +53,11 @@ def joined(values: Iterable[float], digits: int, missing: str = "never") -> str:
     return ", ".join(missing if np.isnan(x) else f"{x:.{digits}f}" for x in values)
 
 
+def with_range(middle: float, values: list[float]) -> str:
+    """A mean or median and, of more than one value, the lowest and the highest."""
+    return f"{middle:.1f}" + f" ({min(values):.1f}–{max(values):.1f})" * (len(values) > 1)
+
+
 def results() -> str:
     """evaluations.csv: mean, lowest and highest of the seeds. leaderboard.csv: scripted crane."""
     levels, lines = ["hydraulic", "randomized", "ideal"], []
@@ -61,7 +66,7 @@ def results() -> str:
         for level in levels:
             rows = evaluations(script, level)
             for score in (numbers(rows, "success"), numbers(rows, "gentle")):
-                cells.append(f"{np.mean(score):.1f} ({min(score):.1f}–{max(score):.1f})")
+                cells.append(with_range(np.mean(score), score))
         lines.append([f"`{script}.py`", *cells])
     board = read_rows(RESULTS / "leaderboard.csv")
     scripted = {row["level"]: row for row in board if row["method"] == "scripted"}
@@ -180,10 +185,8 @@ def timed() -> str:
             whole.append(minutes[-1])
             kept.append(next((minutes[k] for k in good if success[k] >= 0.963), np.nan))
         steps = f"{run['steps'][-1] / 1e6:.2f}"
-        middle = f"{np.median(whole):.1f}"
-        if len(whole) > 1:
-            middle += f" ({min(whole):.1f}–{max(whole):.1f})"
-        lines.append([level, ", ".join(map(str, of_seed)), steps, middle, joined(kept, 1)])
+        minutes = with_range(np.median(whole), whole)
+        lines.append([level, ", ".join(map(str, of_seed)), steps, minutes, joined(kept, 1)])
     header = ["level", "seeds", "steps [million]", "training [min]", "96.3 % kept after [min]"]
     return table(header, lines)
 

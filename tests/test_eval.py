@@ -342,6 +342,7 @@ def test_a_policy_that_does_not_fit_is_refused_in_a_line(judge, tmp_path, traine
     assert "Pendulum-v1 is not the crane" in refused(f"{trained} --env-id Pendulum-v1")
     assert "no nowhere.pt: give a run's folder" in refused("nowhere.pt")
     assert "no nowhere" in refused(f"{trained} nowhere")  # before the first trial
+    assert "--video films one policy" in refused(f"zero {trained} --video a.mp4")
     for line in ("--diameters 0.2", "--seed -1", "--env.frame-skip 0", "--warp 9"):
         assert refused(f"zero {line}") == "2"  # and a box
     assert capsys.readouterr().out == ""

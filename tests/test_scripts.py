@@ -179,10 +179,13 @@ def check_charts(run):
 def test_a_signal_stops_after_the_update_and_resume_goes_on(tmp_path, monkeypatch, script, number):
     """On new episodes, with new samples, in the schedule of the run."""
     run, step, count = Recording(tmp_path), Toy.step, []
+    (terminal := io.StringIO()).close()  # writing to it fails
 
     def signalled(env, action):
         count.append(1)
         if len(count) in (2 * UPDATE + 5, 8 * UPDATE - 2):  # in the third, and in the last
+            if number == signal.SIGHUP:
+                monkeypatch.setattr(sys, "stdout", terminal)
             os.kill(os.getpid(), number)
         return step(env, action)
 
