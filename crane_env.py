@@ -594,8 +594,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.ground_force[:] = 0.0  # a hit of an earlier piece is not this one's
             size = 1 if self.observers else nstep
             for _ in range(nstep // size):
-                left -= size  # sensors are needed after the last physics step only
-                stage = mujoco.mjtStage.mjSTAGE_NONE if left else VEL
+                left -= size  # sensors are read after the last physics step, and by observers
+                stage = VEL if self.observers or not left else mujoco.mjtStage.mjSTAGE_NONE
                 try:
                     self.batch.step(nstep=size, stage=stage)
                 except SimulationError as error:
