@@ -259,11 +259,11 @@ def staged_terms(
     state: CraneState, distance: Array, clearance: Array, miss: Array, command: Array,
     closed: Array, grip: Array,
 ) -> dict[str, Array]:  # fmt: skip
-    """r_grapple pays for jaws that close near the log's centre, r_lift for a log that rises there,
+    """r_grapple pays for closing the jaws near the log's centre, r_lift for lifting it held there,
     r_balance for a crane that holds still while both jaws hold the lifted log, (N,) each.
 
-    distance (N,) in m is ||Delta_p|| + 1 m Delta_psi, with Delta_p 0 where the grapple is
-    CLOSING_HEIGHT higher. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
+    distance (N,) in m is ||Delta_p|| + 1 m Delta_psi, to a point CLOSING_HEIGHT above that of
+    Delta_p = 0. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
     command (N, 6) the commanded velocities in rad/s and m/s. closed and grip (N,) in [0, 1] say how
     far the jaws are closed and how well they would lift.
     """
@@ -298,8 +298,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     `info` describes the step just made, for every crane, also one whose episode just ended: the
     reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass`
     (kg), `time_to_reach` (s, inf before), `ground_peak` (N, largest force of the crane on the
-    ground in this episode), `safe` (all `conditions` have held for HOLD_TIME) and `termination`:
-    the rule that ended the episode, "time_limit" or "none". Where an episode ended, there are
+    ground in this episode), `diverged`, `safe` (all `conditions` have held for HOLD_TIME) and
+    `termination`: the rule that ended the episode, "time_limit" or "none". Where one ended are
     `success` (for Stable-Baselines3 `is_success`), `gentle` (success with at most GENTLE_FORCE on
     the ground) and `failure`: the rule or the first of `conditions` that failed. The mask `_key`
     says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an
@@ -331,14 +331,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
         difficulty: float = 1.0,
         retry: float = 0.0,
-        physics_step: float = 0.0,  # s; above crane.xml's 0.005 up to a whole step; sdf: ignored
+        physics_step: float = 0.0,  # s, in (0.005, one step]; else, and with sdf, crane.xml's
         env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: Literal["human", "rgb_array"] | None = None,
         camera: Literal["overview", "side", "grapple"] = "overview",
         width: int = 640,
         height: int = 480,
         decorate: Callable[[mujoco.MjSpec], None] | None = None,  # adds what is only seen
-        autoreset: bool = True,  # False: `CraneEnv` resets
+        autoreset: bool = True,  # False: the caller resets
         **options: Any,  # `Options`
     ):
         self.options = self.Options(**options)
@@ -420,15 +420,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         actions = np.clip(actions, -1, 1)
         self.command = actions * speed_limit(actions)
 
-        # simulate
         diverged = self.simulate()
         self.steps += 1
         state, time = self.state(), self.steps * self.dt
-
-        # observe
         obs = self.bounded_observation(state, diverged)
-
-        # measure
         info = self.measure(state) | {"time": time, "diverged": diverged}
         reached = self.reached(info) & (time < self.REACH_TIME + 1e-9)
         self.reach_time = np.minimum(self.reach_time, np.where(reached, time, np.inf))
@@ -491,8 +486,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cranes")
-            # Starts, pose noise and what a subclass draws have streams of their own. Not of
-            # s.spawn(3): it counts, and a seed that is given twice would start other episodes.
+            # Starts, pose noise and what a subclass draws have streams of their own. Not by
+            # s.spawn(3): it counts its calls, and a seed given twice would start other episodes.
             streams = [(s, s.generate_state(4), s.generate_state(8)[4:]) for s in seeds]
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
@@ -581,6 +576,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """frame_skip physics steps under `command`; which cranes diverged, (N,)."""
         failed = np.zeros(self.num_envs, bool)
         self.impact[:] = 0.0
+        # A piece may span several short steps: only the first of them drives and clamps.
         steps_per_piece = max(1, self.piece // self.frame_skip)
         due = self.steps % steps_per_piece == 0
         left = self.frame_skip  # physics steps

@@ -115,9 +115,9 @@ BUILT_IN = {
 
 
 LEGEND = """\
-Gentle: success with at most 20 kN of the crane on the ground. Peak: median of all trials. Other
+Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. Other
 averages are of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
-centre), medians of the others. Up: when success was safe."""
+centre), medians of the others. Up: when all conditions of success had held for 0.5 s."""
 PAPERS = " The paper's rule is weaker, and it trained for 500 million physics steps."
 
 
@@ -229,8 +229,7 @@ def print_table(lines: dict[str, dict]) -> None:
 
 def main() -> None:
     sys.path.insert(0, os.getcwd())  # where the user's policies and tasks are
-    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # `2>&-` closes it
-    summary = (__doc__ or "").partition("\n\n")[0]  # python -OO has no docstrings
+    summary = __doc__.partition("\n\n")[0]
     args, flags = tyro.cli(
         Args,
         description=summary + " --env.NAME changes an option of the task, as in the training.",

@@ -16,7 +16,7 @@ With `sensors` the observation has 32 numbers, what the machine measures:
 | 0-17   | those of crane_env.py                                          |       |           |
 | 18-23  | last command of q1, q2, q3, q4, q7, q8, fraction of its limit  | 1     | -1, 1     |
 | 24-25  | velocities of q5, q6                                           | rad/s | -10, 10   |
-| 26-31  | force of the oil on q1, q2, q3, q4, q7, q8, fraction of limit  | 1     | -1, 1     |
+| 26-31  | force of the oil on these six, fraction of `actuatorfrcrange`  | 1     | -1, 1     |
 """
 
 from typing import Annotated, Any
@@ -110,8 +110,8 @@ def oil_per_movement(levers: Array, dq: Array, force: Array) -> Array:
     """Oil that each joint takes, m^3/rad and m^3/m, (N, 6), moving as dq (N, 6).
 
     The same number times a pressure in Pa is the torque or force in that direction, in N m and N.
-    force (N, 6) is that of the drives: a telescope that needs more than the rod side leaves it runs
-    on its full area, and takes that oil.
+    force (N, 6) is that of the drives. A telescope that must push harder than PRESSURE allows with
+    its rod side's oil fed back runs on its full area, and takes that oil.
     """
     oil = np.where(dq < 0, OIL[0], OIL[1])
     oil[:, 1:3] *= levers.T  # of `cylinder_levers`

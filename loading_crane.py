@@ -60,7 +60,7 @@ MOST_ASKEW = np.radians(30)  # of a log to let go; with 15 jaws never opened: fa
 LET_GO_WEIGHT = 6.0  # for a command to open there: squeezing jaws find no other way
 RELEASE_WEIGHT = 4.0  # for jaws that open there
 OFF_WEIGHT = 2.0  # for open jaws that do not touch the log
-LOADED_PAY = 60 * 30.5  # 30.5: what all stages above pay; more than 50 steps: gamma up to 0.98
+LOADED_PAY = 60 * 30.5  # 30.5: all that a step pays above; gamma 0.98 weighs 50 of them
 GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
 

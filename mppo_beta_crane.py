@@ -16,8 +16,9 @@ The rest is PPO with generalized advantage estimation (Schulman et al., 2016, 20
 
 Where an episode ends, A_{t+1} is 0, and V(s_{t+1}) is 0 or, where the time limit cut it, V of the
 last observation. In L, A has mean 0 and std 1 in each minibatch. rho and KL are biased while
-eps > 0: the perturbed action was executed, and they use the unperturbed Beta. Difficulty, policy
-width, horizon and step size follow schedules (docs/training.md).
+eps > 0: the perturbed action was executed, and they use the unperturbed Beta. r_t is the reward
+times reward_scale. Difficulty, policy width, horizon, reward_scale and step size follow schedules
+(docs/training.md).
 
     python mppo_beta_crane.py  # the crane: minutes on two cores
     python mppo_beta_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
@@ -303,7 +304,7 @@ if __name__ == "__main__":
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
 
-        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        # Save after the evaluation: if a kill interrupts it, the resumed run repeats it
         if final or iteration % 10 == 0 or stop.received:
             runs.save(folder, args, envs, agent, optimizer, iteration)
         if stop.received and not final:

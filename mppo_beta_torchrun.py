@@ -320,7 +320,7 @@ if __name__ == "__main__":
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
 
-        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        # Save after the evaluation: if a kill interrupts it, the resumed run repeats it
         if rank == 0 and (final or iteration % 10 == 0 or stopping):
             runs.save(folder, all_args, envs, agent, optimizer, iteration)
         if stopping and not final and rank == 0:

@@ -12,8 +12,9 @@ The paper's first baseline (Vu et al., Sec. V-A), after Schulman et al., 2017:
     KL      = E[rho - 1 - log rho]                    stops the epochs (Schulman, 2020)
 
 Where an episode ends, A_{t+1} is 0, and V(s_{t+1}) is 0 or, where the time limit cut it, V of the
-last observation. In L, A has mean 0 and std 1 in each minibatch. Difficulty, policy width, horizon
-and step size follow schedules (docs/training.md).
+last observation. In L, A has mean 0 and std 1 in each minibatch. r_t is the reward times
+reward_scale. Difficulty, policy width, horizon, reward_scale and step size follow schedules
+(docs/training.md).
 
     python ppo_crane.py  # the crane: minutes on two cores
     python ppo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
@@ -288,7 +289,7 @@ if __name__ == "__main__":
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
 
-        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        # Save after the evaluation: if a kill interrupts it, the resumed run repeats it
         if final or iteration % 10 == 0 or stop.received:
             runs.save(folder, args, envs, agent, optimizer, iteration)
         if stop.received and not final:

@@ -1,8 +1,8 @@
 """A scripted crane: resolved-rate control and four phases, the classical baseline of the policies.
 
-It sees what a policy sees, the 18 numbers of the observation, and learns nothing. It knows the
-crane's lengths and speed limits (assets/README.md) and that Delta_p is 0 where the jaws' tips just
-clear the ground, whatever the log's diameter.
+It sees what a policy sees, 18 numbers and on hydraulic drives the force of the slew's oil, and
+learns nothing. It knows the crane's lengths and speed limits (assets/README.md) and that Delta_p is
+0 where the jaws' tips just clear the ground, whatever the log's diameter.
 
 Frames: K_i = K_{i-1} RotZ(q_i) Trans(a, 0, d) RotX(alpha). A column of the Jacobian is z x (p - o)
 for a joint that turns about the axis z through o, and z for a telescope stage. The passive joints
@@ -28,8 +28,7 @@ force F of its oil, as a fraction of the limit, by relief F.
 Phases of each crane: APPROACH (over the log, turning along it), DESCEND, CLOSE, LIFT. On the task
 of loading_crane.py `ScriptedLoadingCrane` goes on with SWING, LOWER, OPEN and RISE.
 
-    python eval_crane.py scripted                    # --video and --viewer work too
-    python eval_crane.py scripted_crane:UnsignedScriptedCrane --env.signed-yaw False
+    python eval_crane.py scripted  # --video and --viewer work too
 """
 
 from dataclasses import dataclass
@@ -172,13 +171,12 @@ class ScriptedCrane:
     them, else the first.
     """
 
-    signed_yaw = True  # False finds the sign of Delta_psi by turning
     drives = IDEAL, HYDRAULIC
 
     def __init__(self, settings: Settings | None = None):
         self.settings = settings
-        options = {"frame_skip": 20, "offset": "plus", "axes": "crane"}
-        self.task = {"options": options | {"signed_yaw": self.signed_yaw}}  # what it is made for
+        options = {"frame_skip": 20, "offset": "plus", "axes": "crane", "signed_yaw": True}
+        self.task = {"options": options}  # what it is made for
 
     def predict(
         self, obs: np.ndarray, state: "ScriptedCrane | None" = None, deterministic: bool = True
@@ -195,24 +193,6 @@ class ScriptedCrane:
         self.velocity = np.zeros((cranes, 3))  # commanded last, m/s
         self.swing = None  # (N, 3) m, before
         self.q7_goal = np.zeros(cranes)  # rad, over the log
-        self.log_yaw = None  # (N, 2) rad, where the log may lie by the first observation
-        self.doubt = np.zeros((cranes, 2))  # how badly either has predicted Delta_psi since
-
-    def find_signed_angle(self, delta_psi: np.ndarray, grapple_axis: np.ndarray) -> np.ndarray:
-        """Angle to the log (N,) in rad from Delta_psi (N,) = 1 - |cos|, which hides its sign.
-
-        The first observation leaves two yaws for the log, and the rotator turns towards one of
-        them. The log's yaw is the one that has predicted Delta_psi better since.
-        """
-        cosine = (1 - delta_psi) / np.linalg.norm(grapple_axis[:, :2], axis=-1)  # undo the tilt
-        angle = np.arccos(np.clip(cosine, 0, 1))
-        grapple_yaw = np.arctan2(grapple_axis[:, 1], grapple_axis[:, 0])
-        if self.log_yaw is None:
-            self.log_yaw = grapple_yaw[:, None] + np.stack([angle, -angle], axis=-1)
-        predicted = half_turn(self.log_yaw - grapple_yaw[:, None])
-        self.doubt += np.abs(np.abs(predicted) - angle[:, None])
-        better = predicted[np.arange(len(angle)), self.doubt.argmin(axis=-1)]
-        return np.copysign(angle, better)
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         obs, settings = np.asarray(obs, dtype=np.float64), self.settings
@@ -225,15 +205,12 @@ class ScriptedCrane:
         swing = p_centre - p_plumb
         swing_rate = 0 * swing if self.swing is None else (swing - self.swing) / DT
         self.swing, self.swing_rate = swing, swing_rate
-        angle = obs[:, 17]
-        if not self.signed_yaw:
-            angle = self.find_signed_angle(angle, frames[-1, :, :3, 0])
 
         # The rotator turns against yaw, and against the slew to come. A log looks the same after
         # half a turn: keep to one goal, in the middle of the rotator's range.
         x, y, _ = (p_centre + delta_p).T
         slew = np.arctan2(y, x) - np.arctan2(p_plumb[:, 1], p_plumb[:, 0])
-        goal = self.q7_goal + half_turn(q[:, 6] + slew - angle - self.q7_goal)
+        goal = self.q7_goal + half_turn(q[:, 6] + slew - obs[:, 17] - self.q7_goal)
         self.q7_goal = np.where(np.abs(goal) > Q7_MAX, half_turn(goal), goal)
         turn = q[:, 6] + slew - self.q7_goal
 
@@ -289,9 +266,3 @@ class ScriptedCrane:
         way[:, 2] = CARRY_HEIGHT - p_plumb[:, 2]
         velocity = bounded(self.settings.k_p * way, self.settings.max_speed)
         return velocity, np.zeros(len(obs)), np.full(len(obs), self.settings.squeeze)
-
-
-class UnsignedScriptedCrane(ScriptedCrane):
-    """The same for the paper's Delta_psi, which has no sign."""
-
-    signed_yaw = False

@@ -369,7 +369,7 @@ if __name__ == "__main__":
                 writer.add_scalar(f"eval/{name}", score, global_step)
             bar.write(f"{global_step:,} steps: {runs.brief(scores)}")
 
-        # Save, after the evaluation: a run that is killed in it makes it when it is resumed
+        # Save after the evaluation: if a kill interrupts it, the resumed run repeats it
         if final or iteration % 10 == 0 or stop.received:
             runs.save(folder, args, envs, agent, optimizer, iteration)
         if stop.received and not final:

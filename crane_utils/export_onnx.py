@@ -36,6 +36,7 @@ class Predict(nn.Module):
         self.agent = agent
 
     def forward(self, obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        # `predict` ends in numpy(), which a trace cannot follow
         with mock.patch.object(Tensor, "numpy", lambda tensor: tensor):
             actions, state = self.agent.predict(obs, state or None)
         return actions, *(state or ())

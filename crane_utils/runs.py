@@ -40,7 +40,6 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     The defaults of --env.* are those of the task that --env-id names, or of the resumed run.
     """
     sys.path.insert(0, os.getcwd())  # where the user's own tasks are
-    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # `2>&-` closes it
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     scan.add_argument("--env-id", "--env_id", default=arguments.env_id)
     scan.add_argument("--resume", type=Path)
@@ -55,7 +54,7 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
         default = restore_args(arguments, checkpoint)
     else:
         default = arguments(env_id=seen.env_id, env=trials.task_options(seen.env_id) or Options())
-    summary = (description or "").partition("\n\n")[0]  # python -OO has no docstrings
+    summary = description.partition("\n\n")[0]
     # --env.signed-yaw False, and not a flag of its own for each value
     config = (tyro.conf.FlagConversionOff,)
     args = tyro.cli(arguments, default=default, description=summary, config=config)
@@ -103,10 +102,6 @@ def restore(
 def make_folder(args: Any) -> Path:
     """The run's folder: that of --resume, or a new one with a copy of the script."""
     if args.resume:
-        # TensorBoard reads event files in the order of their names, which begin with the clock's
-        # time. A clock that was set back would hide the new updates.
-        for number, file in enumerate(sorted(args.resume.glob("events.out.tfevents.*"))):
-            file.rename(args.resume / f"events.out.tfevents.{number:010d}.resumed")
         with contextlib.suppress(shutil.SameFileError):
             shutil.copy(sys.argv[0], args.resume)  # it may have been edited since
         return args.resume
@@ -198,9 +193,6 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
     sys.modules[spec.name] = module  # where dataclasses look for it
     spec.loader.exec_module(module)
     weights = saved["weights"]
-    finite = {name: w.isfinite().all() for name, w in weights.items() if name[:7] != "action_"}
-    if wrong := [name for name, good in finite.items() if not good]:
-        raise SystemExit(f"{path}: {', '.join(wrong[:3])} not finite")
     bounds = weights["action_low"].numpy(), weights["action_high"].numpy()
     agent = module.Agent(len(weights["obs_mean"]), *bounds, restore_args(module.Args, saved))
     agent.load_state_dict(agent.state_dict() | weights)  # policy.pt has no critic

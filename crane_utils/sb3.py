@@ -8,6 +8,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
 model.learn(100_000)
 print(trials.evaluate(model, "ForestryCrane-v0", trials=100))
+
+This shows the calls, but it lifts no log. docs/compare.md begins with easy starts, and succeeds.
 """
 
 from collections.abc import Sequence

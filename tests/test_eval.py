@@ -333,8 +333,6 @@ def test_a_policy_that_does_not_fit_is_refused_in_a_line(judge, tmp_path, traine
     weights = saved["weights"]
     torch.save(saved | {"weights": weights | {"action_high": weights["action_high"] * 2}}, path)
     assert "[2.0, 2.0, 2.0, 2.0, 2.0, 2.0]" in refused(path)
-    torch.save(saved | {"weights": weights | {"log_std": weights["log_std"] * np.nan}}, path)
-    assert "log_std not finite" in refused(path)
     torch.save(saved | {"weights": Harmful()}, path)
     with pytest.raises(Exception, match="[Ww]eights"):  # pickled code is not run
         judge(path)

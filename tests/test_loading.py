@@ -25,13 +25,14 @@ def lying(x, y, z, yaw=0.0, tilt=0.0, diameter=0.4):
 
 
 def put(envs, x, y, z, diameter=0.4):
-    """One crane far from its log, which lies along the truck at (x, y) with its centre at z."""
+    """Cranes far from their logs, which lie along the truck at (x, y) with the centre at z."""
     envs.reset(seed=0)
-    q = envs.starts[0][0]
+    q, ids = envs.starts[0][0], np.arange(envs.num_envs)
     q[7] = 0.5
-    envs.place(np.arange(1), q[None], np.array([[x, y, np.pi / 2]]), np.array([diameter]))
-    envs.batch.joint("log").qpos[0, 2] = z
-    envs.batch.forward(np.arange(1), stage=loading_crane.crane_env.VEL)
+    logs = np.tile([x, y, np.pi / 2], (len(ids), 1))
+    envs.place(ids, np.tile(q, (len(ids), 1)), logs, np.full(len(ids), diameter))
+    envs.batch.joint("log").qpos[:, 2] = z
+    envs.batch.forward(ids, stage=loading_crane.crane_env.VEL)
 
 
 @pytest.mark.parametrize(
@@ -82,6 +83,15 @@ def test_a_released_log_is_loaded_and_gentle_if_it_did_not_fall(height, gentle):
     bonus = loading_crane.GENTLE_BONUS / max(1, envs.bed_speed[0])  # 1 m/s is gentle
     assert info["r_loaded"] == pytest.approx(loading_crane.LOADED_PAY * (1 + bonus))
     assert 0.5 < info["time"] < 1.5
+
+
+def test_a_hit_is_seen_in_every_physics_step():
+    envs = LoadingCraneVectorEnv(20, env_threads=1, autoreset=False)
+    heights = 0.08 + 0.0063 * np.arange(20)  # m; each log falls a physics step longer
+    put(envs, -4.1, 0, 1.4 + heights)
+    for _ in range(4):
+        envs.step(np.tile(IDLE, (20, 1)))
+    assert envs.bed_speed == pytest.approx(np.sqrt(2 * 9.81 * heights), rel=0.1)
 
 
 def test_a_log_in_the_middle_of_the_bunk_pays_more_than_one_beside_a_stake():
