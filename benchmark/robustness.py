@@ -14,7 +14,6 @@ import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -28,7 +27,7 @@ from tqdm import tqdm
 
 import eval_crane
 from benchmark.runs import LABELS, LEVELS, LOADING, METRICS, RESULTS, ROOT, read_rows, write_rows
-from crane_env import SERVOS
+from crane_env import INTEGRATORS, SERVOS
 from crane_utils import runs
 from crane_utils import trials as protocol
 from crane_utils.scripted_loading import ScriptedLoadingCrane
@@ -69,37 +68,50 @@ class ChangedCranes(HydraulicCraneVectorEnv):
         spec = super().make_spec()
         for index in SERVOS:
             joint = spec.joints[index]
-            joint.actfrcrange *= self.force
             drive = spec.actuator(f"{joint.name}_integral")
             drive.delay, drive.nsample = drive.delay + self.delay, 2 * drive.nsample
         angle, g = np.radians(self.slope), spec.option.gravity[2]
         spec.option.gravity = [-g * np.sin(angle), 0, g * np.cos(angle)]
+        if self.slope:
+            spec.geom("ground").friction[2] = 0.03  # m: else logs roll down from 1.4 degrees on
         return spec
 
+    def limit_forces(self, ids: np.ndarray) -> None:
+        super().limit_forces(ids)
+        self.force_limit[:, ids] *= self.force
+        limits = np.moveaxis(self.force_limit[:, ids], 0, -1)
+        self.engine["actuator_forcerange"][ids, INTEGRATORS] = limits
 
-def policy_of(method: str, level: str) -> tuple[Any, int]:
-    """The shipped policy of a method and a level, and the seed of its training."""
+
+def policy_of(method: str, level: str) -> Any:
+    """The shipped policy of a method and a level."""
     if method == "scripted":
-        return ScriptedCrane(), 1
+        return ScriptedCrane()
     name = METHODS[method] + f"_{level}" * (level != "ideal")
-    path = ROOT / "assets" / "policies" / f"{name}.pt"
-    return runs.load_policy(path)[0], runs.load(path)["args"]["seed"]
+    return runs.load_policy(ROOT / "assets" / "policies" / f"{name}.pt")[0]
 
 
-def add_row(path: Path, key: dict, policy: Any, trained_on: str, env_id: str) -> None:
-    """Success and metrics of a policy, in trials of seed 60000. A row that is there stays."""
+def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then: str = "") -> None:
+    """Success and metrics of a policy, in trials of seed 60000. A row that is there stays.
+
+    then: the same task, and what follows the trial. `held` is success in both.
+    """
     trials = key["per_diameter"]
     key |= {"trial_seed": REPORT_SEED, "trials": 6 * trials}
     key = {name: str(value) for name, value in key.items()}
     known, options = read_rows(path), protocol.task_options(env_id)
     if any(key.items() <= row.items() for row in known):
         return
-    if trained_on == "ideal" and hasattr(options, "sensors"):
-        options = replace(options, sensors=False)
+    if hasattr(options, "sensors"):
+        options = replace(options, sensors=sensors)
     args = eval_crane.Args(seed=REPORT_SEED, trials=trials)
-    line = eval_crane.summarize([*eval_crane.play(policy, env_id, options, args)], {})
+    rows = [*eval_crane.play(policy, env_id, options, args)]
+    line = eval_crane.summarize(rows, {})
     line |= {"success": line["success %"], "gentle": line["gentle %"]}
-    for name in ("success", "gentle", *METRICS):
+    if then:
+        later = eval_crane.play(policy, then, options, args)
+        line["held"] = 100 * np.mean([a["success"] and b["success"] for a, b in zip(rows, later)])
+    for name in ("success", *(["held"] if then else []), "gentle", *METRICS):
         key[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
     write_rows(path, [*known, key])
 
@@ -109,23 +121,23 @@ def levels(trials: int = 100, folder: Path = RESULTS) -> None:
     for method, trained_on, level in tqdm([*product(METHODS, LEVELS, LEVELS)], unit="row"):
         if level == "ideal" and trained_on != "ideal":
             continue  # too few sensors
-        policy, seed = policy_of(method, trained_on)
-        key = {"method": method, "trained_on": trained_on, "seed": seed, "evaluated_on": level}
+        key = {"method": method, "trained_on": trained_on, "evaluated_on": level}
         key["per_diameter"] = trials
-        add_row(folder / "levels.csv", key, policy, trained_on, LEVELS[level])
+        policy = policy_of(method, trained_on)
+        add_row(folder / "levels.csv", key, policy, LEVELS[level], trained_on != "ideal")
 
 
 def loading(trials: int = 100, folder: Path = RESULTS) -> None:
     """Write loading.csv: the scripted crane on the loading tasks."""
     for level, env_id in LOADING.items():
         key = {"method": "scripted", "level": level, "per_diameter": trials}
-        add_row(folder / "loading.csv", key, ScriptedLoadingCrane(), level, env_id)
+        add_row(folder / "loading.csv", key, ScriptedLoadingCrane(), env_id, True)
 
 
 def changes(trials: int = 25, folder: Path = RESULTS) -> None:
     """Write robustness.csv: policies on hydraulic cranes with one of CHANGES."""
-    policies = {method: policy_of(method, "hydraulic")[0] for method in ("mPPO", "scripted")}
-    policies["mPPO, trained on randomized"], _ = policy_of("mPPO", "randomized")
+    policies = {method: policy_of(method, "hydraulic") for method in ("mPPO", "scripted")}
+    policies["mPPO, trained on randomized"] = policy_of("mPPO", "randomized")
     points = [(name, label, x) for name, (label, xs) in CHANGES.items() for x in xs]
     for attribute, label, value in tqdm(points, unit="change"):
         env_id = f"Changed-{attribute}-{str(value).replace('.', '-')}-v0"
@@ -133,38 +145,23 @@ def changes(trials: int = 25, folder: Path = RESULTS) -> None:
         gymnasium.register(env_id, vector_entry_point=cranes)
         for method, policy in policies.items():
             key = {"method": method, "changed": label, "value": value, "per_diameter": trials}
-            add_row(folder / "robustness.csv", key, policy, "hydraulic", env_id)
-
-
-def then_still(policy: Any) -> SimpleNamespace:
-    """A policy for 9 s, and then no command."""
-
-    def predict(obs: np.ndarray, state: tuple | None, deterministic: bool = True) -> tuple:
-        step, memory = state or (0, None)
-        actions, memory = policy.predict(obs, memory, deterministic=deterministic)
-        return actions * (step < 90), (step + 1, memory)
-
-    return SimpleNamespace(predict=predict)
+            add_row(folder / "robustness.csv", key, policy, env_id, True)
 
 
 def held(trials: int = 100, folder: Path = RESULTS) -> None:
     """Write held.csv: success after 9 s, and after ten more seconds without command."""
-    diameters, seeds = protocol.monte_carlo_trials(REPORT_SEED, trials)
-    for task in LEVELS.values():
-        longer = type("Longer", (protocol.crane_class(task),), {"TIME_LIMIT": 19.0})
-        kwargs = gymnasium.spec(task).kwargs
-        gymnasium.register(f"Held{task}", vector_entry_point=longer, kwargs=kwargs)
     for method, (level, task) in tqdm([*product(METHODS, LEVELS.items())], unit="row"):
-        known, (policy, _), good = read_rows(folder / "held.csv"), policy_of(method, level), True
-        key = dict(method=method, level=level, trial_seed=str(REPORT_SEED), trials=str(len(seeds)))
-        if any(key.items() <= row.items() for row in known):
-            continue
-        still = then_still(policy)
-        for name, acting, env_id in ("success", policy, task), ("held", still, f"Held{task}"):
-            envs = protocol.make_envs(env_id, len(seeds), diameter=diameters)
-            good &= protocol.run_trials(acting, envs, seeds)["success"]
-            key[name] = f"{100 * good.mean():.4g}"
-        write_rows(folder / "held.csv", [*known, key])
+
+        class ThenStill(protocol.crane_class(task)):
+            TIME_LIMIT = 19.0
+
+            def step(self, actions: np.ndarray) -> tuple:
+                return super().step(actions * (self.steps[:, None] < 90))
+
+        then, kwargs = f"Held{method.replace(' ', '')}{task}", gymnasium.spec(task).kwargs
+        gymnasium.register(then, vector_entry_point=ThenStill, kwargs=kwargs)
+        key = {"method": method, "level": level, "per_diameter": trials}
+        add_row(folder / "held.csv", key, policy_of(method, level), task, True, then)
 
 
 if __name__ == "__main__":

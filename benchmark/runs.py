@@ -2,8 +2,6 @@
 
     python benchmark/runs.py                             # all that are missing, days on two cores
     python benchmark/runs.py --only curves/ hydraulic    # those with a part of their name
-    python benchmark/runs.py --names                     # only list them
-    python benchmark/runs.py --only curves/ppo --quick   # does it work? tiny runs, in a new folder
 
 The run curves/ppo_crane_seed21 gets a row an update in benchmark/results/curves/. If its file is
 there, it is not made again. Two trainings run side by side with one thread each, those whose
@@ -19,7 +17,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -29,7 +26,6 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import numpy as np
 import tyro
-from pydantic.dataclasses import dataclass
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
@@ -111,8 +107,6 @@ TRAININGS = [  # folder, name, script, flags, seeds
     *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],
 ]  # fmt: skip
-QUICK = "--total-timesteps 768 --num-envs 8 --num-steps 32 --eval-every 2 --eval-trials 1 "
-QUICK += "--final-trials 1"
 METRICS = ("peak [kN]", "oil [l]", "energy [kJ]", "up [s]", "swing [rad]")  # of eval_crane.py
 TAGS = ["charts/episodic_return", "charts/success_rate", "charts/SPS"]
 TAGS += ["eval/success_rate", "eval/gentle_rate", "eval/episodic_return"]
@@ -213,64 +207,52 @@ def evaluate(policy: str, noise: str, *flags: str) -> dict[str, float]:
     return row | {name: whole[name] and float(f"{whole[name]:.4g}") for name in METRICS}
 
 
-def make(run: Run, here: Path, quick: bool) -> str:
+def make(run: Run) -> str:
     """Train or resume a run, evaluate its policy and write its rows. Returns what happened."""
     label, threads = f"{run.folder}_{run.name}", "2" if run.alone else "1"
     folders = f"runs/*__{label}__{run.seed}__*"
     command = [sys.executable, str(ROOT / f"{run.script}.py"), "--threads", threads]
     trained = False  # trained before, but not evaluated
-    if begun := sorted(here.glob(f"{folders}/checkpoint.pt")):
+    if begun := sorted(HERE.glob(f"{folders}/checkpoint.pt")):
         command += ["--resume", str(begun[-1].parent)]
         checkpoint = load(begun[-1])
         args, after = checkpoint["args"], checkpoint["iteration"] + 1
         trained = args["total_timesteps"] < after * args["num_envs"] * args["num_steps"]
     else:
         command += ["--exp-name", label, "--seed", str(run.seed), *run.flags.split()]
-        command += QUICK.split() if quick else []
-    log = here / f"{label}_seed{run.seed}.log"
+    log = HERE / f"{label}_seed{run.seed}.log"
     tqdm.write(f"{'resumed' if begun else 'started'}: {run}, see {log}")
     with open(log, "a", encoding="utf-8") as file:
-        if not trained and subprocess.run(command, cwd=here, stdout=file, stderr=file).returncode:
+        if not trained and subprocess.run(command, cwd=HERE, stdout=file, stderr=file).returncode:
             return f"stopped: {run}, see {log}"
     log.unlink()
-    folder, results, evaluated = max(here.glob(folders)), here / "results", []
+    folder, evaluated = max(HERE.glob(folders)), []
     rows = export(folder)
     if run.folder in ("curves", "levels", "loading", "short"):
         for noise in ("none", "step"):
             key = {"run": label, "seed": run.seed, "pose_noise": noise, "trial_seed": REPORT_SEED}
-            short = ["--trials", "1"] if quick else []
-            evaluated.append(key | evaluate(str(folder), noise, *short))
+            evaluated.append(key | evaluate(str(folder), noise))
     with WRITING:
         if evaluated:
-            for row in read_rows(results / "evaluations.csv"):
+            for row in read_rows(RESULTS / "evaluations.csv"):
                 file = f"{row['run'].replace('_', '/', 1)}_seed{row['seed']}.csv"
-                evaluated += [row] if (results / file).exists() else []
+                evaluated += [row] if (RESULTS / file).exists() else []
             evaluated.sort(key=lambda row: (row["run"], int(row["seed"]), row["pose_noise"]))
-            write_rows(results / "evaluations.csv", evaluated)
-        write_rows(results / f"{run}.csv", rows)  # last: it says that the run is finished
+            write_rows(RESULTS / "evaluations.csv", evaluated)
+        write_rows(RESULTS / f"{run}.csv", rows)  # last: it says that the run is finished
     return f"finished: {run}"
 
 
-@dataclass
-class Args:
-    only: tuple[str, ...] = ()  # parts of names: only runs with one of them
-    names: bool = False  # print the names of the runs and what is missing, make none
-    quick: bool = False  # three small updates and six trials each, in a new folder
-
-
-def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
-    here = Path(tempfile.mkdtemp()) if args.quick else HERE
-    runs = [run for run in RUNS if not args.only or any(part in str(run) for part in args.only)]
-    missing = [run for run in runs if not (here / "results" / f"{run}.csv").exists()]
-    if args.names:
-        return print("\n".join(f"{run}{', missing' * (run in missing)}" for run in runs))
+def main(only: tuple[str, ...] = ("",)) -> None:
+    """only: parts of names: only runs with one of them."""
+    runs = [run for run in RUNS if any(part in str(run) for part in only)]
+    missing = [run for run in runs if not (RESULTS / f"{run}.csv").exists()]
     failed = False
     with tqdm(total=len(runs), initial=len(runs) - len(missing), unit="run") as bar:
         for side_by_side, alone in ((2, False), (1, True)):
             pool = ThreadPoolExecutor(side_by_side)
             chosen = [run for run in missing if run.alone == alone]
-            futures = [pool.submit(make, run, here, args.quick) for run in chosen]
+            futures = [pool.submit(make, run) for run in chosen]
             try:
                 for future in as_completed(futures):
                     tqdm.write(future.result())
@@ -278,13 +260,11 @@ def main() -> None:
                     bar.update()
             finally:  # Ctrl-C and errors start no further run
                 pool.shutdown(cancel_futures=True)
-    if args.quick:
-        print(f"all is in {here}")
     sys.exit(failed)
 
 
 if __name__ == "__main__":
     try:
-        main()
+        tyro.cli(main, description=__doc__)
     except KeyboardInterrupt:
         sys.exit("interrupted; the same command goes on")

@@ -1,8 +1,7 @@
 """Speed of simulator and training, beside bare MuJoCo, Gymnasium and Stable-Baselines3 (SB3).
 
     pip install -r benchmark/requirements.txt
-    python benchmark/speed.py            # half an hour; run nothing else
-    python benchmark/speed.py --quick    # does it work? its numbers mean nothing
+    python benchmark/speed.py    # half an hour; run nothing else
 
 benchmark/results/throughput.csv gets the speeds, measured by turns, and their ratios. Cranes are
 driven by the shipped policy or the scripted crane, whose own time does not count. Trainings are
@@ -10,7 +9,6 @@ timed at their start, from the second iteration on. Ours and SB3 have the same n
 epochs and minibatch. SB3's fastest number of threads and arrangement of cranes counts.
 """
 
-import csv
 import multiprocessing
 import os
 import platform
@@ -51,7 +49,6 @@ from scripted_crane import ScriptedCrane
 
 SEED, CRANES, THREADS, HELD = 1, 64, 2, 20  # HELD: physics steps of an action, at any frame skip
 EPOCHS, MINIBATCHES, FISHER_SAMPLES = 8, 4, 1024
-START = "fork" if sys.platform == "linux" else None  # workers that start fast and share memory
 RATIOS = [  # name, dividend and divisor
     ("`CraneVectorEnv` / twice `mj_step` on one thread", "CraneVectorEnv", "twice mj_step"),
     ("`CraneVectorEnv` / Sync- or AsyncVectorEnv of `PlainCrane`", "CraneVectorEnv", "vectors"),
@@ -188,7 +185,7 @@ def train_ours(script: str, frame_skip: int, rollout: int) -> list[float]:
     flags += f"--total-timesteps {3 * rollout} --update-epochs {EPOCHS} --final-trials 1 "
     batch = f"minibatch-size {rollout // MINIBATCHES}"
     batch = f"num-minibatches {MINIBATCHES}" if script == "recurrent_ppo" else batch
-    flags += f"--env.frame-skip {frame_skip} --{batch} "
+    flags += f"--env.frame-skip {frame_skip} --physics-step 0 --{batch} "
     flags += f"--fisher-samples {FISHER_SAMPLES}" if script == "trpo" else "--target-kl 1e9"
     command = [sys.executable, str(ROOT / f"{script}_crane.py"), *flags.split()]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -203,7 +200,7 @@ def train_sb3(algorithm: str, kind: str, n: int, frame_skip: int, rollout: int) 
     if kind == "Crane":
         envs = CraneVecEnv(n, env_threads=THREADS, frame_skip=frame_skip)
     else:
-        envs = DummyVecEnv(plain) if kind == "Dummy" else SubprocVecEnv(plain, start_method=START)
+        envs = DummyVecEnv(plain) if kind == "Dummy" else SubprocVecEnv(plain)
     policy = {"net_arch": [256, 256], "log_std_init": -1.2}  # as ours start: wilder ones end more
     options = {"n_steps": rollout // n, "batch_size": rollout // MINIBATCHES, "device": "cpu"}
     maker, network, epochs = stable_baselines3.PPO, "MlpPolicy", {"n_epochs": EPOCHS}
@@ -239,11 +236,11 @@ def best_sb3(algorithm: str, ways: list, frame_skip: int, rollout: int) -> list[
 # ---- all of it
 
 
-def cells(quick: bool) -> dict[tuple[str, int], Callable[[], list[float]]]:
+def cells() -> dict[tuple[str, int], Callable[[], list[float]]]:
     """What to measure, by name and frame skip."""
     policy, script = runs.load_policy(Path(SHIPPED))[0], ScriptedCrane()
     os.environ.pop("GOMP_SPINCOUNT", None)  # the script has set it; SB3 has torch's default
-    tenths, rollout = (3, 8 * CRANES) if quick else (90, 128 * CRANES)
+    tenths, rollout = 90, 128 * CRANES
     found: dict = {("the paper's PPO", 1): lambda: [6500.0]}
     for skip in (20, 1):
         assert disagreement(policy, skip) < 1e-3, "PlainCrane is another task"
@@ -264,13 +261,12 @@ def cells(quick: bool) -> dict[tuple[str, int], Callable[[], list[float]]]:
     return found
 
 
-def main(quick: bool = False) -> None:
-    """quick: tiny sizes, and only print."""
+def main() -> None:
     torch.set_num_threads(1)
     if hasattr(os, "sched_setaffinity"):  # Linux: as many cores for everybody
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:THREADS])
-    measured, speeds = cells(quick), defaultdict(list)
-    for key in (bar := tqdm([*measured] * (1 if quick else 3), unit="cell")):
+    measured, speeds = cells(), defaultdict(list)
+    for key in (bar := tqdm([*measured] * 3, unit="cell")):
         bar.set_description(f"{key[0]}, skip {key[1]}")
         speeds[key] += measured[key]()
     libraries = (mujoco, gymnasium, torch, stable_baselines3, sb3_contrib)
@@ -286,9 +282,7 @@ def main(quick: bool = False) -> None:
         if (other, skip) in speeds:
             ratio = np.median(speeds[ours, skip]) / np.median(speeds[other, skip])
             rows.append({"part": "ratio", "what": name, "skip": skip, "median": f"{ratio:.4g}"})
-    csv.DictWriter(sys.stdout, rows[1]).writerows(rows)
-    if not quick:
-        write_rows(RESULTS / "throughput.csv", rows)
+    write_rows(RESULTS / "throughput.csv", rows)
 
 
 if __name__ == "__main__":

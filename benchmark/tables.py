@@ -13,7 +13,7 @@ differs by more than a percentage point.
 import re
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 from pathlib import Path
 
@@ -77,20 +77,23 @@ def results() -> str:
     return table(["policy", *[head for level in levels for head in (level, "gentle")]], lines)
 
 
+def each_seed(folder: str, levels: Iterable[str]) -> Iterator[tuple[list[str], list[dict]]]:
+    """Level, method, steps and seeds as cells, and the rows of evaluations.csv."""
+    curves = read_curves(folder) | (read_curves("curves") if folder == "levels" else {})
+    for level, (script, method) in product(levels, LABELS.items()):
+        if rows := evaluations(script, level, folder=folder):
+            name = script if (folder, level) == ("levels", "ideal") else f"{script}_{level}"
+            steps = dict.fromkeys(f"{run['steps'][-1] / 1e6:.2f}" for run in curves[name].values())
+            yield [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)], rows
+
+
 def seeds() -> str:
     """evaluations.csv: success, gentle success and metrics of each training seed."""
-    lines, curves = [], read_curves("curves") | read_curves("levels")
-    for level in LEVELS:
-        for script, method in LABELS.items():
-            if not (rows := evaluations(script, level)):
-                continue
-            of_seed = curves.get(script if level == "ideal" else f"{script}_{level}", {})
-            steps = dict.fromkeys(f"{run['steps'][-1] / 1e6:.2f}" for run in of_seed.values())
-            line = [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)]
-            for score in (numbers(rows, "success"), numbers(rows, "gentle")):
-                line += [joined(score, 1), f"{np.mean(score):.1f}"]
-            metrics = ("energy [kJ]", "up [s]")
-            lines.append(line + [joined(numbers(rows, name), 1, "-") for name in metrics])
+    lines = []
+    for line, rows in each_seed("levels", LEVELS):
+        for score in (numbers(rows, "success"), numbers(rows, "gentle")):
+            line += [joined(score, 1), f"{np.mean(score):.1f}"]
+        lines.append(line + [joined(numbers(rows, x), 1, "-") for x in ("energy [kJ]", "up [s]")])
     header = ["level", "method", "steps [million]", "seeds", "success", "mean", "gentle", "mean"]
     return table([*header, "energy [kJ]", "up [s]"], lines)
 
@@ -100,7 +103,7 @@ def causes() -> str:
     counts: dict[tuple[str, str], Counter] = defaultdict(Counter)
     for level, (script, method) in product(LEVELS, LABELS.items()):
         for row in evaluations(script, level):
-            for cause in filter(None, row.get("failures", "").split(", ")):
+            for cause in filter(None, row["failures"].split(", ")):
                 name, number = cause.split(" ")
                 counts[level, method][name] += int(number)
             counts[level, method]["trials"] += 600
@@ -113,12 +116,8 @@ def causes() -> str:
 def loading() -> str:
     """evaluations.csv and loading.csv: policies and the scripted crane in the loading cycle."""
     names, lines = ("success", "gentle", "up [s]", "oil [l]", "energy [kJ]"), []
-    for level, (script, method) in product(LOADING, LABELS.items()):
-        if rows := evaluations(script, level, folder="loading"):
-            of_seed = read_curves("loading")[f"{script}_{level}"].values()
-            steps = dict.fromkeys(f"{run['steps'][-1] / 1e6:.2f}" for run in of_seed)
-            line = [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)]
-            lines.append(line + [joined(numbers(rows, name), 1, "-") for name in names])
+    for line, rows in each_seed("loading", LOADING):
+        lines.append(line + [joined(numbers(rows, name), 1, "-") for name in names])
     for row in read_rows(RESULTS / "loading.csv"):
         lines.append([row["level"], "scripted", "", "", *[row[name] for name in names]])
     header = ["level", "method", "steps [million]", "seeds", "success", "gentle", "loaded [s]"]
@@ -268,16 +267,16 @@ def rivals() -> str:
     ends: dict[tuple[str, str], dict] = defaultdict(dict)  # the last row of each seed
     for row in read_rows(RESULTS / "rivals.csv"):  # by minutes
         ends[row["rival"], row["setting"]][row["seed"]] = row
-    ends["mppo_beta", "ours"] = ends.pop(("mppo_beta", "published"))
+    for seed, run in read_curves("curves")[runs.MPPO].items():
+        end = {"steps": run["steps"][-1], "success": 100 * run["eval_success_rate"][-1]}
+        ends["mppo_beta", "ours"][seed] = end
     lines = []
     for rival, name in names.items():
-        steps = np.mean(numbers([*ends[rival, "ours"].values()], "steps")) / 1e6
-        means, cells = [], []
-        for setting in ("ours", "published"):
-            if success := numbers([*ends[rival, setting].values()], "success"):
-                means.append(np.mean(success))
-                cells.append(f"{means[-1]:.1f} ({min(success):.1f}–{max(success):.1f})")
-        lines.append((-means[0], [name, f"{steps:.2f}", *cells, *[""] * (2 - len(cells))]))
+        ours, published = ([*ends[rival, setting].values()] for setting in ("ours", "published"))
+        scores = [numbers(rows, "success") for rows in (ours, published)]
+        cells = [with_range(np.mean(score), score) if score else "" for score in scores]
+        steps = f"{np.mean(numbers(ours, 'steps')) / 1e6:.2f}"
+        lines.append((-np.mean(scores[0]), [name, steps, *cells]))
     header = ["method", "steps [million]", "success, our settings", "success, published settings"]
     return table(header, [line for _, line in sorted(lines)])
 

@@ -11,15 +11,18 @@ from dataclasses import asdict
 
 import mujoco
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 import toy_tasks
 from numpy.random import SeedSequence
 from script_runs import ALGORITHMS, ROOT, Recording
+from stable_baselines3.common.vec_env import VecMonitor
 
 import eval_crane
 from crane_utils import export_onnx, film, runs, trials
 from crane_utils.metrics import Metrics
+from crane_utils.sb3 import CraneVecEnv
 from eval_crane import SHIPPED, wilson_interval
 
 QUICK = "toy_tasks:Quick-v0"  # toy_tasks.Quick says how its trials end
@@ -351,7 +354,7 @@ def test_a_policy_of_the_users_own(judge, tmp_path, monkeypatch):
     code += "    def predict(self, obs, state, deterministic):\n"
     code += "        assert obs.shape == (1, 18) and deterministic\n"
     code += "        return np.full((1, 6), 0.5), state\n"
-    (tmp_path / "my_policy.py").write_text(code)
+    (tmp_path / "my_policy.py").write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     printed = judge("my_policy:Slew --trials 1 --diameters 0.8").out
     assert f"my_policy:Slew (my_policy:Slew) on {QUICK}" in printed
@@ -378,11 +381,9 @@ def test_the_shipped_policy_lifts_logs(judge):
     answer = json.loads(judge(line).out)
     assert answer["policy"] == SHIPPED and answer["table"]["all"]["success %"] > 80
     assert answer["options"]["pose_noise"] == "step"
-    with pytest.raises(SystemExit):
-        judge("--tirals 3")
 
 
-def test_acting_loads_neither_tensorboard_nor_distributed():
+def test_acting_loads_no_tensorboard_matplotlib_or_onnx():
     code = f"import sys; from crane_utils import runs; runs.load_policy(runs.Path({SHIPPED!r}))"
     code += "; print(*sys.modules, sep='\\n')"
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
@@ -397,7 +398,6 @@ def test_acting_loads_neither_tensorboard_nor_distributed():
 @pytest.mark.parametrize("script", ALGORITHMS)
 def test_onnx_acts_as_the_policy(tmp_path, script):
     """In turn, with its memory, for another number of cranes than at the export."""
-    onnxruntime = pytest.importorskip("onnxruntime")
     path, file = POLICIES / f"{script}.pt", tmp_path / "policy.onnx"
     export_onnx.main(path, file)
     (agent, *_), state = runs.load_policy(path), None
@@ -413,7 +413,6 @@ def test_onnx_acts_as_the_policy(tmp_path, script):
 
 
 def test_a_predict_that_a_trace_cannot_repeat_is_not_exported(tmp_path, trained, monkeypatch):
-    pytest.importorskip("onnxruntime")
     shutil.copytree(trained, tmp_path / "run")
     script = tmp_path / "run" / "ppo_crane.py"
     line = "distribution = self.get_distribution(self.normalize(obs))\n"
@@ -429,11 +428,6 @@ def test_a_predict_that_a_trace_cannot_repeat_is_not_exported(tmp_path, trained,
 
 def test_stable_baselines_sees_the_same_cranes(monkeypatch):
     """Also over the ends of episodes, where it wants the last observation in `infos`."""
-    pytest.importorskip("stable_baselines3")
-    from stable_baselines3.common.vec_env import VecMonitor
-
-    from crane_utils.sb3 import CraneVecEnv
-
     view, cranes = CraneVecEnv(5, QUICK, env_threads=1), toy_tasks.Quick(5, env_threads=1)
     view.seed(7)
     np.testing.assert_array_equal(view.reset(), cranes.reset(seed=7)[0])
@@ -457,17 +451,3 @@ def test_stable_baselines_sees_the_same_cranes(monkeypatch):
     view.set_attr("difficulty", 0.25)
     assert view.envs.difficulty == 0.25 and view.get_attr("difficulty", [1]) == [0.25]
     assert view.env_is_wrapped(VecMonitor) == [False] * 5
-
-
-def test_an_edited_script_may_call_its_critic_otherwise(tmp_path, monkeypatch):
-    code = (ROOT / "ppo_crane.py").read_text(encoding="utf-8")
-    (tmp_path / "renamed_ppo.py").write_text(code.replace("critic", "judge"), encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    script = importlib.import_module("renamed_ppo")
-    args = script.Args(hidden_sizes=(8,))
-    agent = script.Agent(18, -np.ones(6, "f4"), np.ones(6, "f4"), args)
-    run = {"script": "renamed_ppo.py", "args": asdict(args), "task": {"env_id": "ForestryCrane-v0"}}
-    runs.write(tmp_path / "policy.pt", run | {"weights": agent.state_dict()})
-    obs = np.ones((3, 18), "f4")
-    loaded = runs.load_policy(tmp_path)[0]
-    np.testing.assert_array_equal(loaded.predict(obs)[0], agent.predict(obs)[0])

@@ -1,9 +1,7 @@
 """Loading: what lies in the bunk, what is lost, what is gentle, the reward's order."""
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import loading_crane
 from crane_env import GENTLE_FORCE, CraneState, CraneVectorEnv
@@ -104,7 +102,7 @@ def test_a_log_in_the_middle_of_the_bunk_pays_more_than_one_beside_a_stake():
 
 
 def test_force_on_the_truck_counts():
-    """Jaws that are driven onto the bed; a crane that rests on the ground is felt as before."""
+    """Jaws that are driven onto the bed."""
     envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
     put(envs, 8, 8, 0.2)
     q = np.array([[-np.pi, 0.66, -0.08, 0, np.pi / 2 - 0.58, np.pi / 2, np.pi / 2, np.pi / 2]])
@@ -215,12 +213,6 @@ def test_a_log_must_be_lifted_within_12_s():
     envs.lifted[:] = [False, True]
     assert list(envs.step(np.zeros((2, 6)))[-1]["termination"]) == ["none", "log_lost"]
     assert envs.step(np.zeros((2, 6)))[-1]["termination"][0] == "not_lifted"
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("env_id", ["ForestryCraneLoading-v0", "ForestryCraneHydraulicLoading-v0"])
-def test_the_ids_make_gymnasium_environments(env_id):
-    check_env(gymnasium.make(f"crane_env:{env_id}").unwrapped, skip_render_check=True)
 
 
 def test_the_scripted_crane_loads_and_later_stages_pay_more():

@@ -336,7 +336,6 @@ def test_wrong_arguments_are_refused_in_a_line_or_a_box(tmp_path, script):
         ("--learning-rate nan", "learning", "finite"),
         ("--num-envs 0", "num", "greater than or equal to 1"),
         ("--warp 9", "--warp"),
-        ("--env.frame-skip 0", "frame", "greater than or equal to 1"),
         ("--env-id CartPole-v1", "CartPole-v1", "flat Box"),
         ("--env-id toy_tasks:BonusCrane-v0", "BonusCrane-v0 wraps a crane", "hook"),
         ("--env-id toy_tasks:Toy-v0 --env.contact sdf", "Toy-v0 is not the crane"),
