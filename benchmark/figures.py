@@ -15,14 +15,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from numpy import ndarray as Array
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 from tyro.conf import Positional
 
 import eval_crane
 from benchmark import runs, tables
 from benchmark.runs import LABELS, LEVELS, RESULTS, ROOT, Curve, read_curves, read_rows
-from crane_utils import film, trials
+from crane_utils import trials
 from crane_utils.world import decorate
 from hydraulic_crane import HydraulicCraneVectorEnv
 
@@ -245,8 +245,11 @@ def pictures(
     obs, state, taken, end = crane.reset(seed=seeds[-1:])[0], None, [], False
     for step in tqdm(range(crane.max_steps + 1), unit="step", leave=False):
         if end or step % every == 0:
-            lines = {f"{diameter} m": f"{step * crane.dt:.1f} s{label}"}
-            taken.append(Image.fromarray(film.frame(crane, lines)))
+            taken.append(Image.fromarray(crane.render()[0]))
+            pen, text = ImageDraw.Draw(taken[-1], "RGBA"), f"{diameter} m, {step * crane.dt:.1f} s"
+            pen.rectangle((0, 0, size[0], 22), fill=(0, 0, 0, 120))
+            font = ImageFont.load_default(14)
+            pen.text((6, 3), f"{text}{label}", font=font, fill="white")
         if end:
             break
         actions, state = agent.predict(obs, state)
