@@ -376,8 +376,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.qpos, self.qvel, self.ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         self.act, self.qfrc_bias = batch.bind("act")[:, :8], batch.bind("qfrc_bias")
         self.sensordata = batch.bind("sensordata")
-        # history ends with ground_force, the only sensor that has one: x, y, z of the last steps
-        self.ground_force = batch.bind("history")[:, -3 * self.piece :]
+        self.ground_force = self.history("ground_force")
         self.joint_range = model.jnt_range[JOINTS]  # (8, 2), rad and m
         self.servo_kp = np.tile(model.actuator_gainprm[INTEGRATORS, 0], (num_envs, 1))
         # N m and N, lowest and highest that each servo may push with, (2, N, 8)
@@ -399,6 +398,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
+    def history(self, name: str) -> Array:
+        """Live values of a sensor in its last `nsample` physics steps, (N, nsample x size)."""
+        i = self.model.sensor(name).id
+        n = self.model.sensor_history[i, 0]
+        start = self.model.sensor_historyadr[i] + 2 + n  # behind the times of the samples
+        return self.batch.bind("history")[:, start : start + n * self.model.sensor_dim[i]]
+
     @property
     def task(self) -> dict[str, Any]:
         """What a trained policy knows of its task."""
@@ -411,7 +417,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         RuntimeError before `reset`, ValueError for actions of another shape or not finite.
         """
-        # command
         actions = np.asarray(actions, dtype=np.float64)
         if self.rngs is None:
             raise RuntimeError("call reset() before step()")
@@ -419,7 +424,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"actions must be finite, ({self.num_envs}, 6), got {actions}")
         actions = np.clip(actions, -1, 1)
         self.command = actions * speed_limit(actions)
-
         diverged = self.simulate()
         self.steps += 1
         state, time = self.state(), self.steps * self.dt
@@ -589,9 +593,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             np.clip(self.act, low, high, out=self.act, where=due[:, None])
             self.ground_force[:] = 0.0  # a hit of an earlier piece is not this one's
             size = 1 if self.observers else nstep
+            left -= nstep  # sensors are read after the last physics step, and by observers
+            stage = VEL if self.observers or not left else mujoco.mjtStage.mjSTAGE_NONE
             for _ in range(nstep // size):
-                left -= size  # sensors are read after the last physics step, and by observers
-                stage = VEL if self.observers or not left else mujoco.mjtStage.mjSTAGE_NONE
                 try:
                     self.batch.step(nstep=size, stage=stage)
                 except SimulationError as error:
