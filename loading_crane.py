@@ -2,10 +2,9 @@
 
 Starts and rules are those of crane_env.py; easy tasks also start on the way. Within 30 s the log
 must lie in the bunk, between the stakes, within 15 degrees of the truck's axis, slower than 0.05
-m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded". A log that is not
-lifted within 12 s, or is lost later, ends it, too. The success is gentle if the crane itself never
-pressed on ground or truck with more than 20 kN, and the log never met the bed faster than 1 m/s. In
-`ground_peak` 1 m/s counts as 20 kN.
+m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded". A log not lifted
+within 12 s, or lost later, ends it, too. It is gentle if the crane never pressed on ground or truck
+with more than 20 kN, and the log never met the bed faster than 1 m/s (20 kN in `ground_peak`).
 
 Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. On the
 machine joint sensors and a camera that sees both ends of the log give them, here without noise.
@@ -24,7 +23,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 import crane_env
-from crane_env import GENTLE_FORCE, LOG_LENGTH, MIN_CLEARANCE, Q8_MAX, SPEED_LIMITS, CraneState
+from crane_env import GENTLE_FORCE, LOG_LENGTH, MIN_CLEARANCE, Q8_MAX, CraneState, centred
 from hydraulic_crane import HydraulicCraneVectorEnv
 
 # ---- the bunk, as in assets/crane.xml, and what "loaded" means
@@ -56,10 +55,9 @@ ALONG_WEIGHT = 2.0  # r_lower depends on it, too: a released log cannot be turne
 TOO_HIGH, HIGHEST = 3.6, 8.0  # m, of the lowest point: from here it pays less, from there nothing
 LOWER_WEIGHT = 4.0  # from TOO_HIGH to the bed
 LOW = 0.45  # m above the bed, where no pay asks for a grip: opening jaws need room below them
-MOST_ASKEW = np.radians(30)  # of a log to let go; with 15 jaws never opened: falling logs tilt
-LET_GO_WEIGHT = 6.0  # for a command to open there: squeezing jaws find no other way
-RELEASE_WEIGHT = 4.0  # for jaws that open there
-OFF_WEIGHT = 2.0  # for open jaws that do not touch the log
+MOST_ASKEW = np.radians(30)  # of a log to let go, less from half of it: falling logs tilt
+LET_GO_WEIGHT = 6.0  # for jaws that squeeze less there: soft drives must, long before they open
+RELEASE_WEIGHT, OFF_WEIGHT = 4.0, 2.0  # for jaws that open there; that are open and off the log
 LOADED_PAY = 60 * 30.5  # 30.5: all that a step pays above; gamma 0.98 weighs 50 of them
 GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
@@ -203,19 +201,22 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         over = over_bunk(state) & (lowest >= BED - HIT)
         askew = np.arccos(np.minimum(np.abs(state.log_axis[:, 0]), 1))  # rad, turned or tilted
         low = over & (lowest < BED + LOW) & (askew < MOST_ASKEW)
-        held = crane_env.centred(info["centre_miss"]) * state.touching.all(axis=-1)
-        held[low] = 1.0
+        held = np.where(low, 1.0, centred(info["centre_miss"]) * state.touching.all(axis=-1))
         high = 1 - (lowest - TOO_HIGH) / (HIGHEST - TOO_HIGH)
         up = np.clip(np.where(over, high, np.minimum(lowest / CARRY_HEIGHT, high)), 0, 1) * held
         to_go = np.pi - np.abs(np.arctan2(y, x))  # rad round the slew axis
         radius_miss = (np.hypot(x, y) - abs(PLACE_X)) / RADIUS_MISS
         near = np.exp(-(radius_miss**2)) * np.clip(1 - to_go / SWING_ANGLE, 0, 1)
         there, middle = up * near, over * np.exp(-((y / MIDDLE_MISS) ** 2))
-        along, straight = 1 - askew / (np.pi / 2), np.clip(1 - askew / MOST_ASKEW, 0, 1)
+        along, straight = 1 - askew / (np.pi / 2), np.clip(2 - 2 * askew / MOST_ASKEW, 0, 1)
         down = np.clip((TOO_HIGH - lowest) / (TOO_HIGH - BED), 0, 1)
+        lowered = over * held * along * down * (1 + middle) / 2
+        there[low] = along[low] = lowered[low] = 1.0  # opening jaws roll and turn the log
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
-        lets_go = np.where(opened == 1, 1.0, (1 - self.command[:, 5] / SPEED_LIMITS[1, 5]) / 2)
+        squeeze = self.servo_kp[:, 6:] * (self.act[:, 6:] - self.qpos[:, 8:10])  # N m
+        squeeze = (squeeze / self.force_limit[1, :, 6:]).mean(axis=-1)  # from -0.6 to 1
+        lets_go = np.where(opened == 1, 1.0, (1 - squeeze) / 2)
         gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
         for name in ("r_distance", "r_grapple", "r_lift"):
             terms[name] = np.where(low, LIFTED_PAY / 3, terms[name])
@@ -224,7 +225,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
             "r_swing": SWING_WEIGHT * there,
             "r_along": ALONG_WEIGHT * there * along,
             "r_middle": MIDDLE_WEIGHT * up * middle,
-            "r_lower": LOWER_WEIGHT * over * held * along * down * (1 + middle) / 2,
+            "r_lower": LOWER_WEIGHT * lowered,
             "r_let_go": LET_GO_WEIGHT * low * straight * lets_go,
             "r_release": low * straight * gentle * (RELEASE_WEIGHT * opened + OFF_WEIGHT * off),
             "r_loaded": LOADED_PAY * (info["termination"] == "loaded") * gentle,
@@ -234,8 +235,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 class HydraulicLoadingCraneVectorEnv(HydraulicCraneVectorEnv, LoadingCraneVectorEnv):
     """N hydraulic cranes that load. Its hooks call those of the loading crane."""
 
-    # Locked oil keeps pressing half-open jaws on the bed. With 3, 10 and 30 they never opened.
-    REVISION, GROUND_WEIGHT = 1, 0.0
+    REVISION, GROUND_WEIGHT = 1, 0.0  # locked oil presses half-open jaws on the bed
 
 
 class HydraulicLoadingCraneEnv(crane_env.CraneEnv):
