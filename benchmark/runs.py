@@ -95,6 +95,7 @@ ABLATIONS = {  # what it is in the figure, script and flags
                      "--gae-lambda 0.98979 --reward-scale 0.012"),
 }  # fmt: skip
 SHORT = "--total-timesteps 614400 --eval-every 10 "
+HALF = "--total-timesteps 512000 --update-epochs 8 --learning-rate 1e-3 --eval-every 8"
 FIVE, THREE = range(21, 26), range(21, 24)
 TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
@@ -103,7 +104,7 @@ TRAININGS = [  # folder, name, script, flags, seeds
     *[("loading", f"{MPPO}_{level}", MPPO, CYCLE + env_id, THREE)
       for level, env_id in LOADING.items()],
     ("printed", MPPO, MPPO, PRINTED, (21,)),
-    ("short", MPPO, MPPO, "--total-timesteps 512000 --eval-every 8", THREE),
+    ("short", MPPO, MPPO, HALF, THREE),
     *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],
 ]  # fmt: skip
