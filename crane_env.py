@@ -259,7 +259,7 @@ def staged_terms(
     state: CraneState, distance: Array, clearance: Array, miss: Array, command: Array,
     closed: Array, grip: Array,
 ) -> dict[str, Array]:  # fmt: skip
-    """r_grapple pays for closing the jaws near the log's centre, r_lift for lifting it held there,
+    """r_grapple pays for closing the jaws near the log's centre, r_lift for lifting it there,
     r_balance for a crane that holds still while both jaws hold the lifted log, (N,) each.
 
     distance (N,) in m is ||Delta_p|| + 1 m Delta_psi, to a point CLOSING_HEIGHT above that of
@@ -299,7 +299,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass`
     (kg), `time_to_reach` (s, inf before), `ground_peak` (N, largest force of the crane on the
     ground in this episode), `diverged`, `safe` (all `conditions` have held for HOLD_TIME) and
-    `termination`: the rule that ended the episode, "time_limit" or "none". Where one ended are
+    `termination`: the rule that ended the episode, "time_limit" or "none". At an end there are
     `success` (for Stable-Baselines3 `is_success`), `gentle` (success with at most GENTLE_FORCE on
     the ground) and `failure`: the rule or the first of `conditions` that failed. The mask `_key`
     says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an

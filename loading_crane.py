@@ -3,8 +3,8 @@
 Starts and rules are those of crane_env.py; easy tasks also start on the way. Within 30 s the log
 must lie in the bunk, between the stakes, within 15 degrees of the truck's axis, slower than 0.05
 m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded". A log not lifted
-within 12 s, or lost later, ends it, too. It is gentle if the crane never pressed on ground or truck
-with more than 20 kN, and the log never met the bed faster than 1 m/s (20 kN in `ground_peak`).
+within 12 s, or lost later, ends it, too. A load is gentle if the crane never pressed on ground or
+truck with more than 20 kN, and the log never met the bed faster than 1 m/s, 20 kN in `ground_peak`.
 
 Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. On the
 machine joint sensors and a camera that sees both ends of the log give them, here without noise.
@@ -55,10 +55,10 @@ ALONG_WEIGHT = 2.0  # r_lower depends on it, too: a released log cannot be turne
 TOO_HIGH, HIGHEST = 3.6, 8.0  # m, of the lowest point: from here it pays less, from there nothing
 LOWER_WEIGHT = 4.0  # from TOO_HIGH to the bed
 LOW = 0.45  # m above the bed, where no pay asks for a grip: opening jaws need room below them
-MOST_ASKEW = np.radians(30)  # of a log to let go, less from half of it: falling logs tilt
-LET_GO_WEIGHT = 6.0  # for jaws that squeeze less there: soft drives must, long before they open
+MOST_ASKEW = np.radians(30)  # of a log that may be let go; full pay up to half of it
+LET_GO_WEIGHT = 6.0  # for jaws that squeeze less there; soft drives open long after
 RELEASE_WEIGHT, OFF_WEIGHT = 4.0, 2.0  # for jaws that open there; that are open and off the log
-LOADED_PAY = 60 * 30.5  # 30.5: all that a step pays above; gamma 0.98 weighs 50 of them
+LOADED_PAY = 60 * 30.5  # 30.5: most that a step pays above; at gamma 0.98 waiting is worth 50
 GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
 
@@ -146,7 +146,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
     # ---- what is observed and measured, what ends an episode, the reward
 
     def simulate(self) -> Array:
-        """Also looks how fast the log met the bed, where they touched."""
+        """The physics steps, and how fast the log met the bed in them, where they touched."""
         diverged = super().simulate()
         hits = np.linalg.norm(self.on_bed.reshape(self.num_envs, -1, 4)[..., 1:], axis=-1)
         self.bed_speed = fastest = np.maximum(self.bed_speed, hits.max(axis=-1))

@@ -10,7 +10,7 @@ the grapple swings. A policy with a memory can infer both:
   the state that its crane had when the rollout began.
 
 Advantages A, returns R, the loss and what the time limit does are those of ppo_crane.py.
-Difficulty, policy width, horizon and step size follow schedules (docs/training.md).
+Difficulty, policy width, horizon, reward_scale and step size follow schedules (docs/training.md).
 
     python recurrent_ppo_crane.py  # the crane: minutes on two cores
     python recurrent_ppo_crane.py --env-id Pendulum-v1 --num-envs 8 --gamma 0.9 --log-std-init 0

@@ -16,7 +16,7 @@ The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
 - The critic is fitted on its own, by minibatches of (V - R)^2.
 
 Advantages A, returns R and the time limit are as in ppo_crane.py. A is scaled over the rollout.
-Difficulty, width, horizon, delta and the critic's step size follow schedules (docs/training.md).
+Difficulty, width, horizon, reward_scale, delta and step size have schedules (docs/training.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
     python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64

@@ -12,7 +12,7 @@ differs by more than a percentage point.
 
 import re
 import sys
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 from pathlib import Path
@@ -98,21 +98,6 @@ def seeds() -> str:
     return table([*header, "energy [kJ]", "up [s]"], lines)
 
 
-def causes() -> str:
-    """evaluations.csv: what failed trials are counted under, sums of the training seeds."""
-    counts: dict[tuple[str, str], Counter] = defaultdict(Counter)
-    for level, (script, method) in product(LEVELS, LABELS.items()):
-        for row in evaluations(script, level):
-            for cause in filter(None, row["failures"].split(", ")):
-                name, number = cause.split(" ")
-                counts[level, method][name] += int(number)
-            counts[level, method]["trials"] += 600
-    names = [name for name, _ in sum(counts.values(), Counter()).most_common() if name != "trials"]
-    heads = ["trials", *names]
-    lines = [[*key, *(str(of[name] or "") for name in heads)] for key, of in counts.items()]
-    return table(["level", "method", *(f"`{name}`" for name in heads)], lines)
-
-
 def loading() -> str:
     """evaluations.csv and loading.csv: policies and the scripted crane in the loading cycle."""
     names, lines = ("success", "gentle", "up [s]", "oil [l]", "energy [kJ]"), []
@@ -188,17 +173,6 @@ def timed() -> str:
         lines.append([level, ", ".join(map(str, of_seed)), steps, minutes, joined(kept, 1)])
     header = ["level", "seeds", "steps [million]", "training [min]", "96.3 % kept after [min]"]
     return table(header, lines)
-
-
-def printed() -> str:
-    """printed/: mPPO with the printed reward and observation, at the paper's own budget."""
-    lines, million = [], [5, 10, 15, 20, 25]
-    for seed, run in read_curves("printed").get(runs.MPPO, {}).items():
-        for name in ("success_rate", "gentle_rate", "episodic_return"):
-            scale = 1 if name == "episodic_return" else 100
-            row = np.interp(np.multiply(million, 1e6), run["steps"], scale * run[f"eval_{name}"])
-            lines.append([name.replace("_", " "), str(seed), *(f"{x:.1f}" for x in row)])
-    return table(["evaluation", "seed", *(f"{steps} million" for steps in million)], lines)
 
 
 def ablations() -> str:
@@ -291,8 +265,8 @@ def held() -> str:
     return table(["policy", *LEVELS], lines)
 
 
-ALL = (results, seeds, causes, loading, learning, paper, costs, held, timed, printed, ablations)
-ALL += (robustness, speed, leaderboard, rivals)
+ALL = (results, seeds, loading, learning, paper, costs, held, timed, ablations, robustness, speed)
+ALL += (leaderboard, rivals)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 

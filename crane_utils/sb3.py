@@ -9,7 +9,7 @@ model = SAC("MlpPolicy", VecMonitor(CraneVecEnv(16)), verbose=1)
 model.learn(100_000)
 print(trials.evaluate(model, "ForestryCrane-v0", trials=100))
 
-This shows the calls, but it lifts no log. docs/compare.md begins with easy starts, and succeeds.
+In so few steps of the full task it lifts no log: docs/compare.md begins with easy starts.
 """
 
 from collections.abc import Sequence

@@ -153,6 +153,16 @@ def test_wrappers_find_what_they_look_for():
         assert set(info) == MEASURED | OF_STEPS | others
 
 
+def test_observers_see_the_sensors_after_every_physics_step():
+    coarse, fine, seen = cranes(), cranes(frame_skip=1), []
+    coarse.observers.append(lambda envs: seen.append(envs.state().grapple_centre[0]))
+    actions = np.full((1, 6), 0.5)
+    coarse.step(actions)
+    for k in range(20):
+        fine.step(actions)
+        np.testing.assert_array_equal(seen[k], fine.state().grapple_centre[0])
+
+
 def test_returned_arrays_are_not_live():
     envs = HydraulicCraneVectorEnv(2, randomize=1.0)
     envs.TIME_LIMIT = 0.3
