@@ -12,7 +12,7 @@ differs by more than a percentage point.
 
 import re
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 from pathlib import Path
@@ -87,15 +87,25 @@ def each_seed(folder: str, levels: Iterable[str]) -> Iterator[tuple[list[str], l
             yield [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)], rows
 
 
+def causes(rows: list[dict[str, str]]) -> str:
+    """What failed trials are counted under, sums of the seeds, the most frequent first."""
+    counts: Counter[str] = Counter()
+    for row in rows:
+        for cause in filter(None, row["failures"].split(", ")):
+            name, number = cause.split(" ")
+            counts[re.sub("_q.$", "", name)] += int(number)
+    return ", ".join(f"`{name}` {number}" for name, number in counts.most_common())
+
+
 def seeds() -> str:
-    """evaluations.csv: success, gentle success and metrics of each training seed."""
+    """evaluations.csv: success and gentle success of each training seed, causes of failures."""
     lines = []
     for line, rows in each_seed("levels", LEVELS):
         for score in (numbers(rows, "success"), numbers(rows, "gentle")):
             line += [joined(score, 1), f"{np.mean(score):.1f}"]
-        lines.append(line + [joined(numbers(rows, x), 1, "-") for x in ("energy [kJ]", "up [s]")])
+        lines.append([*line, causes(rows)])
     header = ["level", "method", "steps [million]", "seeds", "success", "mean", "gentle", "mean"]
-    return table([*header, "energy [kJ]", "up [s]"], lines)
+    return table([*header, "failures by cause"], lines)
 
 
 def loading() -> str:
