@@ -28,7 +28,7 @@ from hydraulic_crane import HydraulicCraneVectorEnv
 
 matplotlib.use("Agg")
 matplotlib.rcParams["svg.hashsalt"] = "curves"  # the same curves give the same file
-FIGURES = ROOT / "assets" / "figures"
+FIGURES, SHIPPED = ROOT / "assets" / "figures", ROOT / "assets" / "policies"
 PAPER = np.mean([*eval_crane.PAPER["none"].values()])  # % of mPPO, Table I
 # Geryyy/crane_model, test/step_response_fixture.json: means over the edges of a recording
 INSTANTS = np.array([0.06, 0.10, 0.15, 0.20, 0.30, 0.45, 0.60, 0.90, 1.20])  # s
@@ -234,11 +234,11 @@ def drives() -> None:
 
 def pictures(
     policy: str, diameter: float, trial: int = 0, every: int = 1, label: str = "",
-    size: tuple[int, int] = (400, 300),
+    camera: str = "overview", size: tuple[int, int] = (400, 300),
 ) -> list[Image.Image]:  # fmt: skip
     """Labelled pictures of a trial of seed 60000, one in `every` steps and the last."""
     agent, task, _ = eval_crane.load_policy(policy)
-    look = {"render_mode": "rgb_array", "decorate": decorate}
+    look = {"render_mode": "rgb_array", "decorate": decorate, "camera": camera}
     look |= {"width": size[0], "height": size[1], "diameter": diameter, "autoreset": False}
     crane = trials.make_envs(task["env_id"], 1, 1, task["options"], **look).unwrapped
     seeds = trials.monte_carlo_trials(trials.REPORT_SEED, trial + 1, [diameter])[1]
@@ -269,23 +269,26 @@ def sheet(taken: list[Image.Image], columns: int, path: Path) -> None:
     print(f"written to {path}")
 
 
-def grasp(policy: Positional[str] = eval_crane.SHIPPED, diameter: float = 0.5) -> None:
+def grasp(
+    policy: Positional[str] = f"{SHIPPED}/mppo_beta_crane_hydraulic.pt", diameter: float = 0.5
+) -> None:
     """Make grasp.jpg: one trial, a picture each 0.7 s."""
-    taken = pictures(policy, diameter, every=7)
+    taken = pictures(policy, diameter, every=7, camera="grapple")
     sheet(taken[:12], 4, FIGURES / "grasp.jpg")
 
 
-def failures(policy: Positional[str] = eval_crane.SHIPPED, most: int = 8) -> None:
-    """Make failures.jpg: the ends of failed trials of seed 60000, with their causes."""
+def failures(policy: Positional[str] = f"{SHIPPED}/trpo_crane.pt") -> None:
+    """Make failures.jpg: ends of up to eight failed trials of seed 60000, with their causes."""
     agent, task, _ = eval_crane.load_policy(policy)
     options = trials.crane_class(task["env_id"]).Options(**task["options"])
     args = eval_crane.Args(seed=trials.REPORT_SEED)
     rows = [*eval_crane.play(agent, task["env_id"], options, args)]
     rows = [row for row in rows if not row["success"]]
     taken = []
-    for row in rows[:: -(-len(rows) // most)]:
-        label = f", {row['failure'].replace('_', ' ')}"
-        taken += pictures(policy, row["diameter"], row["trial"], 1000, label)[-1:]
+    for k in np.unique(np.linspace(0, len(rows) - 1, 8).astype(int)):
+        diameter, trial = rows[k]["diameter"], rows[k]["trial"]
+        label = f", {rows[k]['failure'].replace('_', ' ')}"
+        taken += pictures(policy, diameter, trial, 1000, label, camera="grapple")[-1:]
     sheet(taken, 4, FIGURES / "failures.jpg")
 
 
