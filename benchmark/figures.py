@@ -28,7 +28,7 @@ from hydraulic_crane import HydraulicCraneVectorEnv
 
 matplotlib.use("Agg")
 matplotlib.rcParams["svg.hashsalt"] = "curves"  # the same curves give the same file
-FIGURES, SHIPPED = ROOT / "assets" / "figures", ROOT / "assets" / "policies"
+FIGURES, POLICIES = ROOT / "assets" / "figures", ROOT / "assets" / "policies"
 PAPER = np.mean([*eval_crane.PAPER["none"].values()])  # % of mPPO, Table I
 # Geryyy/crane_model, test/step_response_fixture.json: means over the edges of a recording
 INSTANTS = np.array([0.06, 0.10, 0.15, 0.20, 0.30, 0.45, 0.60, 0.90, 1.20])  # s
@@ -270,14 +270,14 @@ def sheet(taken: list[Image.Image], columns: int, path: Path) -> None:
 
 
 def grasp(
-    policy: Positional[str] = f"{SHIPPED}/mppo_beta_crane_hydraulic.pt", diameter: float = 0.5
+    policy: Positional[str] = f"{POLICIES}/mppo_beta_crane_hydraulic.pt", diameter: float = 0.5
 ) -> None:
     """Make grasp.jpg: one trial, a picture each 0.7 s."""
     taken = pictures(policy, diameter, every=7, camera="grapple")
     sheet(taken[:12], 4, FIGURES / "grasp.jpg")
 
 
-def failures(policy: Positional[str] = f"{SHIPPED}/trpo_crane.pt") -> None:
+def failures(policy: Positional[str] = f"{POLICIES}/trpo_crane.pt") -> None:
     """Make failures.jpg: ends of up to eight failed trials of seed 60000, with their causes."""
     agent, task, _ = eval_crane.load_policy(policy)
     options = trials.crane_class(task["env_id"]).Options(**task["options"])
