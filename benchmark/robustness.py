@@ -113,7 +113,7 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
         line["held"] = 100 * np.mean([a["success"] and b["success"] for a, b in zip(rows, later)])
     for name in ("success", *(["held"] if then else []), "gentle", *METRICS):
         key[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
-    write_rows(path, [*known, key])
+    write_rows(path, [*known, key | {"failures": line["failures"]}])
 
 
 def levels(trials: int = 100, folder: Path = RESULTS) -> None:

@@ -112,11 +112,13 @@ def loading() -> str:
     """evaluations.csv and loading.csv: policies and the scripted crane in the loading cycle."""
     names, lines = ("success", "gentle", "up [s]", "oil [l]", "energy [kJ]"), []
     for line, rows in each_seed("loading", LOADING):
-        lines.append(line + [joined(numbers(rows, name), 1, "-") for name in names])
+        cells = [joined(numbers(rows, name), 1, "-") for name in names]
+        lines.append([*line, *cells, causes(rows)])
     for row in read_rows(RESULTS / "loading.csv"):
-        lines.append([row["level"], "scripted", "", "", *[row[name] for name in names]])
+        cells = [row[name] for name in names]
+        lines.append([row["level"], "scripted", "", "", *cells, causes([row])])
     header = ["level", "method", "steps [million]", "seeds", "success", "gentle", "loaded [s]"]
-    return table([*header, "oil [l]", "energy [kJ]"], lines)
+    return table([*header, "oil [l]", "energy [kJ]", "failures by cause"], lines)
 
 
 def steps_to(run: Curve, level: float) -> float:
