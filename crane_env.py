@@ -324,7 +324,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
     GROUND_WEIGHT, GROUND_MOST = 30.0, 1.0
-    FULL_STARTS = 1.0  # difficulty from which on starts are those of the task
+    FULL_STARTS = 1.0  # from this difficulty on starts are those of the task
 
     def __init__(
         self,
@@ -540,8 +540,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         else:
             self.starts[i] = *sample_start(start_rng), {}  # {}: what a subclass draws with it
         self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
-        start, easy = self.starts[i][:3], self.difficulty / self.FULL_STARTS
-        return ease_start(*start, easy) if easy < 1 else start
+        start, difficulty = self.starts[i][:3], self.difficulty / self.FULL_STARTS
+        return ease_start(*start, difficulty) if difficulty < 1 else start
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""

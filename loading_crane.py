@@ -38,8 +38,8 @@ GENTLE_SPEED, CONTACTS = 1.0, 4  # m/s, of a log that meets the bed, a fall of 5
 LOG_VELOCITY, LOG_TURNING = slice(10, 13), slice(13, 15)  # of qvel; turning across its own axis
 
 # ---- easy starts on the way to the bunk: a log in closed jaws, as stiff servos hold it there
-HELD_SHARE = 0.15  # of the cranes at difficulty 0, none at 1; more drown what the others learn
-NEAR = 3  # power of the way to go: half of them have less than an eighth, and soon let go
+HELD_SHARE = 0.15  # of the cranes at difficulty 0, none at 1 (docs/learned.md, Lift first)
+NEAR = 3  # half of them have less than 1 / 2**NEAR of the way to go, and soon let go
 HELD_JOINTS = [1.1, 0.05, 0.0], [1.2, 0.15, 0.4]  # q2, q3, q4: tip 4 to 5 m out, 4.7 to 5.7 m up
 GRIP_Q8 = ([0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [2.87, 2.62, 2.42, 2.20, 1.96, 1.75])  # m, rad
 GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame of the grapple
