@@ -67,7 +67,7 @@ from pydantic.dataclasses import dataclass
 # ---- the machine
 
 MODEL_PATH = Path(__file__).parent / "assets" / "crane.xml"
-VEL = mujoco.mjtStage.mjSTAGE_VEL  # the engine's stage that makes positions and sensors current
+VEL = mujoco.mjtStage.mjSTAGE_VEL  # makes positions, velocities and contacts current, not forces
 SPEED_LIMITS = np.array(  # lowest and highest of q1, q2, q3, q4, q7, q8: rad/s, per stage m/s
     [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
 )
@@ -186,7 +186,7 @@ class CraneState(NamedTuple):
     log_axis: Array  # (N, 3) along the log, unit
     touching: Array  # (N, 2) bool, outer and inner jaw on the log
     diameter: Array  # (N,) m
-    carried: Array  # (N,) 1 - (force of log and crane on the ground) / (log's weight), in [0, 1]
+    carried: Array  # (N,) 1 - (force of log and crane on the ground) / (log's weight); 1 at a start
 
 
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
@@ -293,7 +293,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`.
 
     Crane i's starts depend on the seed, on i and, with retry, on how its episodes ended. They do
-    not depend on N or on the threads.
+    not depend on N (but easy ones of loading_crane.py do) or on the threads.
 
     `info` describes the step just made, for every crane, also one whose episode just ended: the
     reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass`
@@ -339,7 +339,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         width: int = 640,
         height: int = 480,
         decorate: Callable[[mujoco.MjSpec], None] | None = None,  # adds what is only seen
-        autoreset: bool = True,  # False: the caller resets
+        autoreset: bool = True,  # False: the caller resets, whatever `metadata` says
         **options: Any,  # `Options`
     ):
         self.options = self.Options(**options)

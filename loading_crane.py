@@ -59,7 +59,7 @@ LOW = 0.45  # m above the bed, where no pay asks for a grip: opening jaws need r
 MOST_ASKEW = np.radians(30)  # of a log that may be let go; full pay up to half of it
 LET_GO_WEIGHT = 6.0  # for jaws that squeeze less there; soft drives open long after
 RELEASE_WEIGHT, OFF_WEIGHT = 4.0, 2.0  # for jaws that open there; that are open and off the log
-LOADED_PAY = 60 * 30.5  # 30.5: most that a step pays above; at gamma 0.98 waiting is worth 50
+LOADED_PAY = 60 * 30.5  # 30.5: most of a step without bonus; at gamma 0.98 waiting is worth 50
 GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
 
 
@@ -215,7 +215,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
         squeeze = self.servo_kp[:, 6:] * (self.act[:, 6:] - self.qpos[:, 8:10])  # N m
-        squeeze = (squeeze / self.force_limit[1, :, 6:]).mean(axis=-1)  # from -0.6 to 1
+        squeeze = (squeeze / self.force_limit[1, :, 6:]).mean(axis=-1)  # 1 at most
         lets_go = np.where(opened == 1, 1.0, (1 - squeeze) / 2)
         gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
         for name in ("r_distance", "r_grapple", "r_lift"):

@@ -31,7 +31,7 @@ from scripted_crane import (
 
 BUNK_RADIUS, BUNK_AZIMUTH = -PLACE_X, -np.pi  # m, rad; logs start at azimuths down to -2.1
 BUNK_Q7 = -np.pi / 2  # rad, of a log along the truck
-WAIT_AZIMUTH = -2.4  # rad; any log is 1.3 m from the truck there, so it waits there to be high
+WAIT_AZIMUTH = -2.4  # rad; an aligned log waits there, 1.1 m or more from the stakes, to be high
 RISE_HEIGHT = 3.0  # m, of p_C; the jaws are then above the stakes
 DRAG_HEIGHT = 0.3  # m, of the log's lowest point, before it turns and moves sideways
 SLIPPED = 0.85  # m, of Delta_p; a gripped log has at most 0.7
