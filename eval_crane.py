@@ -115,10 +115,10 @@ BUILT_IN = {
 
 
 LEGEND = """\
-Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. Other
-averages are of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
-centre), medians of the others. Up: when all conditions of success had held for 0.5 s."""
-PAPERS = " The paper's rule is weaker, and it trained for 500 million physics steps."
+Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. The
+rest is of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
+centre), medians of all else. Up: when all conditions of success had held for 0.5 s."""
+PAPERS = " The paper's rule is weaker. Its training took 500 million physics steps."
 
 
 def load_policy(name: str, env_id: str | None = None) -> tuple[Any, dict[str, Any], str]:

@@ -164,7 +164,7 @@ class Agent(nn.Module):
     def predict(
         self, obs: np.ndarray, state: State | None = None, deterministic: bool = True
     ) -> tuple:
-        """Actions (B, act_dim) for raw obs (B, obs_dim), and the memory; None where all begin."""
+        """Actions (B, act_dim) for raw obs (B, obs_dim), next state. None starts episodes."""
         obs = torch.as_tensor(obs, dtype=torch.float64, device=self.obs_mean.device)
         state = self.initial_state(len(obs)) if state is None else state
         no_starts = torch.zeros(1, len(obs), device=obs.device)
@@ -268,7 +268,7 @@ if __name__ == "__main__":
             features, _ = agent.remember(obs, first_state, starts)
             values = agent.get_value(features)
             logprobs = agent.get_distribution(features).log_prob(actions).sum(-1)
-            # V(next_obs) needs the memory one step later. The rollout's own memory stays as it is.
+            # V(next_obs) needs the memory after next_obs. `state` stays: the next rollout uses it.
             features, _ = agent.remember(agent.normalize(next_obs)[None], state, next_start[None])
             next_value = agent.get_value(features[0])
         advantages = compute_gae(rewards, values, next_value, dones, gamma, args.gae_lambda)
@@ -279,7 +279,7 @@ if __name__ == "__main__":
         for _ in range(args.update_epochs):
             epoch_kls = []
             for mb in torch.randperm(args.num_envs, device=device).chunk(args.num_minibatches):
-                mb_state = (first_state[0][mb], first_state[1][mb])
+                mb_state = first_state[0][mb], first_state[1][mb]
                 features, _ = agent.remember(obs[:, mb], mb_state, starts[:, mb])
                 distribution = agent.get_distribution(features)
                 logratio = distribution.log_prob(actions[:, mb]).sum(-1) - logprobs[:, mb]
@@ -312,7 +312,7 @@ if __name__ == "__main__":
         global_step = iteration * batch_size
         stats = {name: np.mean(numbers) for name, numbers in stats.items()}
         stats |= trials.rollout_report(envs, infos)
-        explained = 1 - (advantages.var() / (returns.var() + 1e-8)).item()
+        explained = 1 - (advantages.var() / (returns.var() + 1e-8)).item()  # A = R - V
         stats |= {"losses/explained_variance": explained, "schedule/gamma": gamma}
         stats["charts/learning_rate"] = left * args.learning_rate
         stats["charts/SPS"] = batch_size / (time.perf_counter() - began)

@@ -330,9 +330,9 @@ if __name__ == "__main__":
         full_step = torch.sqrt(2 * delta / (curvature + 1e-12)) * direction
         fraction, kl, improvement = line_search(agent, full_step, batch, delta, args)
         stats = defaultdict(list)
-        stats["losses/policy_loss"].append(-(surrogate.item() + improvement))
-        stats["losses/entropy"].append(old.entropy().sum(-1).mean().item())
-        stats["policy/std"].append(old.stddev.mean().item())
+        stats["losses/policy_loss"] = [-(surrogate.item() + improvement)]
+        stats["losses/entropy"] = [old.entropy().sum(-1).mean().item()]
+        stats["policy/std"] = [old.stddev.mean().item()]
         stats["losses/approx_kl"], stats["trpo/step_fraction"] = [kl], [fraction]
 
         # Critic update
