@@ -103,15 +103,16 @@ def test_a_log_in_the_middle_of_the_bunk_pays_more_than_one_beside_a_stake():
 
 def test_low_in_the_bunk_squeezing_less_pays_and_rolling_costs_nothing():
     envs, terms = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False), []
-    for squeeze, aside in [(1.0, 0.0), (0.0, 0.0), (0.0, 0.3)]:
+    for squeeze, aside, command in [(1.0, 0.0, 0.9), (0.0, 0.0, 0.0), (0.0, 0.3, 0.0)]:
         put(envs, -4.1, aside, 1.4)
         envs.qpos[:, 8:10] = 2.0  # rad, half open
         lead = envs.force_limit[1, :, 6:] / envs.servo_kp[:, 6:]  # rad, at full force
         envs.act[:, 6:] = envs.qpos[:, 8:10] + squeeze * lead
+        envs.command[:, 5] = command  # rad/s, half of the jaws' speed limit
         info = envs.measure(state := envs.state()) | {"termination": np.array(["none"])}
         terms.append(envs.reward_terms(state, info))
     full, none, rolled = terms
-    assert full["r_let_go"] == pytest.approx(0, abs=1e-9)
+    assert full["r_let_go"] == pytest.approx(loading_crane.LET_GO_WEIGHT / 8)  # (1 - 1/2) / 4
     assert none["r_let_go"] == pytest.approx(loading_crane.LET_GO_WEIGHT / 2)
     for name in ("r_swing", "r_along", "r_lower", "r_let_go", "r_release"):
         assert rolled[name] == pytest.approx(none[name], rel=1e-6), name
