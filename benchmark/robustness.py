@@ -4,6 +4,7 @@
     python benchmark/robustness.py changes    # results/robustness.csv: a hydraulic crane, changed
     python benchmark/robustness.py loading    # results/loading.csv: the scripted crane loads
     python benchmark/robustness.py held       # results/held.csv: ten more seconds without command
+    python benchmark/robustness.py contacts   # results/contacts.csv: the paper's SDF contacts
     python benchmark/robustness.py changes --trials 1 --folder /tmp/test    # does it work?
 
 The policies are the shipped ones and the scripted crane. Rows that a file has are not measured
@@ -27,7 +28,7 @@ from tqdm import tqdm
 
 import eval_crane
 from benchmark.runs import LABELS, LEVELS, LOADING, METRICS, RESULTS, ROOT, read_rows, write_rows
-from crane_env import INTEGRATORS, SERVOS
+from crane_env import INTEGRATORS, SERVOS, CraneVectorEnv
 from crane_utils import runs
 from crane_utils import trials as protocol
 from crane_utils.scripted_loading import ScriptedLoadingCrane
@@ -164,7 +165,18 @@ def held(trials: int = 100, folder: Path = RESULTS) -> None:
         add_row(folder / "held.csv", key, policy_of(method, level), task, True, then)
 
 
+def contacts(trials: int = 25, folder: Path = RESULTS) -> None:
+    """Write contacts.csv: policies of the ideal level in the paper's SDF contacts."""
+    task = "CraneWithSDFContacts-v0"
+    gymnasium.register(task, vector_entry_point=CraneVectorEnv, kwargs={"contact": "sdf"})
+    for method in tqdm(METHODS, unit="row"):
+        key = {"method": method, "per_diameter": trials}
+        add_row(folder / "contacts.csv", key, policy_of(method, "ideal"), task, False)
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    commands = {"levels": levels, "changes": changes, "loading": loading, "held": held}
-    tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)
+    commands = (levels, changes, loading, held, contacts)
+    tyro.extras.subcommand_cli_from_dict(
+        {command.__name__: command for command in commands}, description=__doc__
+    )

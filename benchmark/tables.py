@@ -268,13 +268,15 @@ def rivals() -> str:
 
 
 def held() -> str:
-    """held.csv: success after 9 s / after ten more seconds without command."""
+    """held.csv: success after 9 s / after ten more seconds without command. contacts.csv: SDF."""
     of = {(r["method"], r["level"]): r for r in read_rows(RESULTS / "held.csv")}
+    sdf = {row["method"]: row["success"] for row in read_rows(RESULTS / "contacts.csv")}
     lines = []
     for method in [*LABELS.values(), "scripted"]:
         rows = [of.get((method, level), {"success": "", "held": ""}) for level in LEVELS]
-        lines.append([method, *(f"{row['success']} / {row['held']}" for row in rows)])
-    return table(["policy", *LEVELS], lines)
+        cells = [f"{row['success']} / {row['held']}" for row in rows]
+        lines.append([method, *cells, sdf.get(method, "")])
+    return table(["policy", *LEVELS, "ideal, SDF contacts"], lines)
 
 
 ALL = (results, seeds, loading, learning, paper, costs, held, timed, ablations, robustness, speed)
