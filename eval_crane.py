@@ -115,9 +115,9 @@ BUILT_IN = {
 
 
 LEGEND = """\
-Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. The
-rest is of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
-centre), medians of all else. Up: when all conditions of success had held for 0.5 s."""
+Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. The other
+columns are of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
+centre), medians of the others. Up: when all conditions of success had held for 0.5 s."""
 PAPERS = " The paper's rule is weaker. Its training took 500 million physics steps."
 
 

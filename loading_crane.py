@@ -49,14 +49,14 @@ CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the sta
 LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
 HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
 SWING_WEIGHT = 3.0  # more than for the height: the way to the bunk takes longer
-SWING_ANGLE, RADIUS_MISS = 2.2, 2.5  # rad to the bunk at 0, logs start 2.1 away; m off it, at 1/e
+SWING_ANGLE, RADIUS_MISS = 2.2, 2.5  # rad away where r_swing is 0; m off its radius where 1/e
 MIDDLE_WEIGHT, MIDDLE_MISS = 1.5, 0.6  # beside a stake jaws cannot open; m off it, at 1/e
 ALONG_WEIGHT = 2.0  # r_lower depends on it, too: a released log cannot be turned
 TOO_HIGH, HIGHEST = 3.6, 8.0  # m, of the lowest point: from here it pays less, from there nothing
 LOWER_WEIGHT = 4.0  # from TOO_HIGH to the bed
 LOW = 0.45  # m above the bed, where no pay asks for a grip: opening jaws need room below them
 MOST_ASKEW = np.radians(30)  # of a log that may be let go; full pay up to half of it
-LET_GO_WEIGHT = 12.0  # for jaws that squeeze less there and are told to open; soft ones open late
+LET_GO_WEIGHT = 12.0  # for a weaker squeeze there and for the command to open
 RELEASE_WEIGHT, OFF_WEIGHT = 4.0, 2.0  # for jaws that open there; that are open and off the log
 LOADED_PAY = 60 * 36.5  # 36.5: most of a step without bonus; at gamma 0.98 waiting is worth 50
 GENTLE_BONUS = 1.0  # added share of r_release and r_loaded up to GENTLE_FORCE, less beyond
@@ -215,7 +215,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         off = (opened == 1) & (self.on_log == 0)
         squeeze = self.servo_kp[:, 6:] * (self.act[:, 6:] - self.qpos[:, 8:10])  # N m
         squeeze = (squeeze / self.force_limit[1, :, 6:]).mean(axis=-1)  # 1 at most
-        told = -self.command[:, 5] / crane_env.SPEED_LIMITS[1, 5]  # clamped jaws feel no noise
+        told = -self.command[:, 5] / crane_env.SPEED_LIMITS[1, 5]  # noise moves it at any squeeze
         lets_go = np.where(opened == 1, 1.0, (2 - squeeze + told) / 4)
         gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
         for name in ("r_distance", "r_grapple", "r_lift"):

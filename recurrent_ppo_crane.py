@@ -164,7 +164,7 @@ class Agent(nn.Module):
     def predict(
         self, obs: np.ndarray, state: State | None = None, deterministic: bool = True
     ) -> tuple:
-        """Actions (B, act_dim) for raw obs (B, obs_dim), next state. None starts episodes."""
+        """Actions (B, act_dim) for raw obs (B, obs_dim), and next state. None starts episodes."""
         obs = torch.as_tensor(obs, dtype=torch.float64, device=self.obs_mean.device)
         state = self.initial_state(len(obs)) if state is None else state
         no_starts = torch.zeros(1, len(obs), device=obs.device)

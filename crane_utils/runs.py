@@ -1,7 +1,7 @@
 """A training run: its arguments, its folder, stop signals, and the policy that it leaves behind.
 
-Nothing here learns. A run's folder has four files: TensorBoard's events, policy.pt to
-act with, checkpoint.pt to resume from, and a copy of the script that wrote them.
+Nothing here learns. A run's folder has four files: TensorBoard's events, policy.pt to act with,
+checkpoint.pt to resume from, and a copy of the script that wrote them.
 """
 
 import argparse
@@ -61,7 +61,7 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     if checkpoint:
-        # these shape networks and rollouts
+        # These shape networks and rollouts.
         for name in ("env_id", "num_envs", "num_steps", "hidden_sizes", "lstm_size"):
             if getattr(args, name, None) != (was := getattr(default, name, None)):
                 raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
