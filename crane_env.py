@@ -259,8 +259,8 @@ def staged_terms(
     state: CraneState, distance: Array, clearance: Array, miss: Array, command: Array,
     closed: Array, grip: Array,
 ) -> dict[str, Array]:  # fmt: skip
-    """r_grapple pays for closing the jaws near the log's centre, r_lift for lifting it there,
-    r_balance for a crane that holds still while both jaws hold the lifted log, (N,) each.
+    """r_distance pays for coming near, r_grapple for closing the jaws near the log's centre, r_lift
+    for lifting it there, r_balance for holding still while both jaws hold it up, (N,) each.
 
     distance (N,) in m is ||Delta_p|| + 1 m Delta_psi, to a point CLOSING_HEIGHT above that of
     Delta_p = 0. clearance and miss (N,) in m are `log_clearance` and `centre_miss`,
@@ -305,9 +305,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an
     episode, because the observation is that of the next start (SAME_STEP autoreset).
 
-    `difficulty` in [0, 1] eases the starts (1 is the full task), `retry` in [0, 1] is the largest
-    share of episodes that repeat a failed start. Both may be set at any time. `observers` are
-    called as observer(envs) after each physics step.
+    `difficulty` in [0, 1] eases the starts and makes hits cheaper (1 is the full task), `retry` in
+    [0, 1] is the largest share of episodes that repeat a failed start. Both may be set at any time.
+    `observers` are called as observer(envs) after each physics step.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -321,7 +321,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_DISCRETE  # of a larger physics_step
     COARSE_HITS = 0.0  # forces of hits count times (larger / exact step)^this (docs/training.md)
     PIECE = 0.025  # s between two clamps of the integrators (assets/README.md)
-    # r_ground is 0 up to half of GENTLE_FORCE. Then it falls linearly: -GROUND_WEIGHT at
+    # In the full task r_ground falls linearly from 0 at half of GENTLE_FORCE to -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
     GROUND_WEIGHT, GROUND_MOST = 30.0, 1.0
     FULL_STARTS = 1.0  # from this difficulty on starts are those of the task
@@ -332,7 +332,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
         difficulty: float = 1.0,
         retry: float = 0.0,
-        physics_step: float = 0.0,  # s, in (0.005, one step]; else, and with sdf, crane.xml's
+        physics_step: float = 0.0,  # s, if above crane.xml's 0.005, at most a step, and not sdf
         env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: Literal["human", "rgb_array"] | None = None,
         camera: Literal["overview", "side", "grapple"] = "overview",
@@ -448,8 +448,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         terminated = done & ~truncated
         success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
         gentle = success & (self.ground_peak <= GENTLE_FORCE)
-        failure = np.select([~ok for ok in held.values()], [*held], default="")
-        failure = np.where(done & ~success, np.where(terminated, ending, failure), "")
+        unmet = [~ok for ok in held.values()]  # in the order of `conditions`
+        failure = np.select([~done | success, terminated, *unmet], ["", ending, *held], default="")
         ends = {"success": success, "is_success": success, "gentle": gentle, "failure": failure}
         info |= ends | {"termination": ending}
 
@@ -477,7 +477,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return obs, reward, terminated, truncated, info
 
     def checked(self, values: dict[str, Array]) -> dict[str, Array]:
-        """What a hook returned. ValueError names a value that NumPy would silently repeat."""
+        """What a hook returned. ValueError names one that NumPy would broadcast."""
         for name, value in values.items():
             if np.shape(value) != self.steps.shape:
                 raise ValueError(f"{name} must be {self.steps.shape}, not {np.shape(value)}")
@@ -540,7 +540,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         else:
             self.starts[i] = *sample_start(start_rng), {}  # {}: what a subclass draws with it
         self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
-        start, difficulty = self.starts[i][:3], self.difficulty / self.FULL_STARTS
+        start = tuple(np.copy(part) for part in self.starts[i][:3])  # hooks may change it in place
+        difficulty = self.difficulty / self.FULL_STARTS
         return ease_start(*start, difficulty) if difficulty < 1 else start
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
@@ -583,8 +584,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # A piece may span several short steps: only the first of them drives and clamps.
         steps_per_piece = max(1, self.piece // self.frame_skip)
         due = self.steps % steps_per_piece == 0
-        left = self.frame_skip  # physics steps
-        while left:
+        for left in range(self.frame_skip, 0, -self.piece):  # physics steps
             nstep = min(self.piece, left)
             self.drive(np.flatnonzero(due), nstep * steps_per_piece * self.model.opt.timestep)
             # Anti-windup: an integrator leads its joint by no more than the force limit can use.
@@ -593,8 +593,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             np.clip(self.act, low, high, out=self.act, where=due[:, None])
             self.ground_force[:] = 0.0  # a hit of an earlier piece is not this one's
             size = 1 if self.observers else nstep
-            left -= nstep  # sensors are read after the last physics step, and by observers
-            stage = VEL if self.observers or not left else mujoco.mjtStage.mjSTAGE_NONE
+            # Sensors are read after the last physics step, and by observers after each.
+            stage = VEL if self.observers or left == nstep else mujoco.mjtStage.mjSTAGE_NONE
             for _ in range(nstep // size):
                 try:
                     self.batch.step(nstep=size, stage=stage)
@@ -625,14 +625,14 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
         # as in crane.xml; sensors of your own go behind the crane's force on the ground
         parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17, 20], axis=1)
-        *poses, touch, support, pressure, _ = parts
+        *poses, touch, log_support, crane_press, _ = parts
         weight = np.linalg.norm(self.model.opt.gravity) * self.batch.body("log").mass[:, 0]
-        ground = np.linalg.norm(support, axis=-1) + np.linalg.norm(pressure, axis=-1)
+        ground = np.linalg.norm(log_support, axis=-1) + np.linalg.norm(crane_press, axis=-1)
         carried = np.clip(1 - ground / weight, 0, 1)
         return CraneState(q, dq, *poses, touch > 0, 2 * self.batch.geom("log").size[:, 0], carried)
 
     def bounded_observation(self, state: CraneState, diverged: Array | bool = False) -> Array:
-        """`observe` as float32 (N, n) within the space, from 0 where a crane diverged."""
+        """`observe` as float32 (N, n), clipped to the space; so are zeros for diverged cranes."""
         space, obs = self.observation_space, self.observe(state)
         if obs.shape != space.shape:
             raise ValueError(f"observe gives {obs.shape}, observation_limits {space.shape}")

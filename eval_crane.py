@@ -251,11 +251,12 @@ def main() -> None:
     overall = {}
     for name, label, policy, env_id, options in evaluated:
         scene = {"seed": args.seed, "trial": args.trial, "camera": args.camera}
+        scene["deterministic"] = not args.stochastic
         if args.viewer:
             film.window(policy, label, env_id, asdict(options), args.diameters[0], **scene)
             continue
         if args.video:
-            scene |= {"width": args.width, "deterministic": not args.stochastic}
+            scene["width"] = args.width
             film.film(policy, label, env_id, asdict(options), args.video, args.diameters, **scene)
             continue
         rows = []

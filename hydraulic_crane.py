@@ -16,7 +16,7 @@ With `sensors` the observation has 32 numbers, what the machine measures:
 | 0-17   | those of crane_env.py                                          |       |           |
 | 18-23  | last command of q1, q2, q3, q4, q7, q8, fraction of its limit  | 1     | -1, 1     |
 | 24-25  | velocities of q5, q6                                           | rad/s | -10, 10   |
-| 26-31  | force of the oil on these six, fraction of `actuatorfrcrange`  | 1     | -1, 1     |
+| 26-31  | force of the oil on q1, q2, q3, q4, q7, q8, fraction of limit  | 1     | -1, 1     |
 """
 
 from typing import Annotated, Any
@@ -52,7 +52,7 @@ FIRST_SERVO = [0, 1, 2, 3, 5, 6]  # of each command: the first telescope stage, 
 PASSIVE = [4, 5]  # of our q1 ... q8
 
 # What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
-# damping are wide, so their logarithms are uniform. All else is uniform.
+# damping are wide, so their logarithms are uniform. All else is uniform. joint_error: rad, not q4.
 DRAWN = {
     "stiffness": (STIFFNESS, [2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4],
                   [3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),
@@ -217,8 +217,8 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
     def limit_forces(self, ids: Array) -> None:
         """No drive of cranes `ids` pushes harder than PRESSURE allows where its joint is now."""
         levers = cylinder_levers(*self.qpos[ids, 1:3].T)
-        speed = np.ones((len(ids), 6))  # below at any load: the telescope may use its full area
-        areas = [oil_per_movement(levers, sign * speed, np.inf * speed) for sign in (-1, 1)]
+        ones = np.ones((len(ids), 6))  # an infinite force: the telescope may use its full area
+        areas = [oil_per_movement(levers, sign * ones, np.inf * ones) for sign in (-1, 1)]
         most = (PRESSURE * np.array(areas) / SERVOS_OF_ACTION)[:, :, ACTION_OF_SERVO]
         most = np.minimum(most, self.model.jnt_actfrcrange[SERVOS, 1])
         limits = np.stack([-most[0], most[1]])

@@ -6,8 +6,8 @@ m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded".
 within 12 s, or lost later, ends it, too. A load is gentle if the crane never pressed on ground or
 truck with more than 20 kN, and the log never met the bed faster than 1 m/s, 20 kN in `ground_peak`.
 
-Five numbers follow the 18 of crane_env.py, before the sensors of the hydraulic crane. On the
-machine joint sensors and a camera that sees both ends of the log give them, here without noise.
+Five numbers follow the 18 of crane_env.py, before the hydraulic crane's sensors. On the machine
+joint sensors and a camera would give them. They have the errors of `randomize`, no `pose_noise`.
 
 | index | meaning                                                      | unit | low, high   |
 |-------|--------------------------------------------------------------|------|-------------|
@@ -73,7 +73,7 @@ def over_bunk(state: CraneState) -> Array:
 
 
 def in_bunk(state: CraneState) -> Array:
-    """Whether it is there, and its lowest point below the stakes' tops, (N,)."""
+    """Whether the log is over the bunk, not through its bed, and below the stakes' tops, (N,)."""
     lowest = crane_env.log_clearance(state)
     return over_bunk(state) & (lowest >= BED - HIT) & (lowest < STAKE_TOP)
 
@@ -101,7 +101,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         for sensor in (spec.sensor("ground_force"), spec.sensor("log_support")):
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
         contact = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "reftype": mujoco.mjtObj.mjOBJ_BODY}
-        # data of a contact, which of them, how many: "found linvel", any, CONTACTS; "found", any, 1
+        # intprm: data (1 "found", 128 "linvel" in m/s), reduction (0: none), how many contacts
         contact |= {"refname": "log", "objtype": mujoco.mjtObj.mjOBJ_GEOM}
         bed = {"nsample": self.options.frame_skip, "intprm": [129, 0, CONTACTS]}
         spec.add_sensor(name="log_on_bed", objname="bed", **bed, **contact)
@@ -118,7 +118,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         q, log_pose, diameter = super().draw_episode(i)
         self.starts_held[i] = i + 0.5 < HELD_SHARE * (1 - self.difficulty) * self.num_envs
         if self.starts_held[i]:
-            q, (*_, rng) = q.copy(), self.rngs[i]
+            *_, rng = self.rngs[i]
             q[0], q[1:4] = (q[0] + np.pi) * rng.uniform() ** NEAR - np.pi, rng.uniform(*HELD_JOINTS)
             q[4:6] = np.pi / 2 - q[1] - q[2], np.pi / 2
         return q, log_pose, diameter
@@ -188,7 +188,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         dropped = ((self.loose > 0) & (lowest < SETTLED)) | (self.loose >= self.hold_steps)
         lost = self.lifted & dropped & (outside | (lowest < BED - HIT))
         ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}
-        self.lifted |= (info["clearance"] >= MIN_CLEARANCE) & state.touching.all(axis=-1)
+        self.lifted |= (lowest >= MIN_CLEARANCE) & state.touching.all(axis=-1)
         return super().rules(state, info) | ends | {"loaded": info["safe"]}
 
     def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:

@@ -55,7 +55,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; 0, as in evaluations, is the task's own 0.005
+    physics_step: Factor = 0.01  # s, in training; 0 to 0.005 is the task's own, as in evaluations
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout

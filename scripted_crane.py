@@ -191,7 +191,7 @@ class ScriptedCrane:
     def start(self, cranes: int) -> None:
         self.phase = np.full(cranes, APPROACH)
         self.velocity = np.zeros((cranes, 3))  # commanded last, m/s
-        self.swing = None  # (N, 3) m, before
+        self.swing = None  # (N, 3) m, of the last step
         self.q7_goal = np.zeros(cranes)  # rad, over the log
 
     def act(self, obs: np.ndarray) -> np.ndarray:
@@ -260,7 +260,8 @@ class ScriptedCrane:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What cranes do from LIFT on: velocity (N, 3) m/s, turn (N,) rad/s, jaws' command (N,).
 
-        This crane only lifts. p_plumb (N, 3) in m is the grapple's place when plumb.
+        This crane only lifts. A subclass may also set `self.phase` here. p_plumb (N, 3) in m is the
+        grapple's place when plumb.
         """
         way = np.zeros_like(p_plumb)
         way[:, 2] = CARRY_HEIGHT - p_plumb[:, 2]

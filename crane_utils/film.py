@@ -128,7 +128,7 @@ def film(
 
 def window(
     policy: Any, name: str, env_id: str, options: dict[str, Any], diameter: float = 0.5,
-    seed: int = 10_000, trial: int = 0, camera: str = "overview",
+    seed: int = 10_000, trial: int = 0, camera: str = "overview", deterministic: bool = True,
 ) -> None:  # fmt: skip
     """Show trials in real time until the window is closed. Keys: HELP.
 
@@ -190,7 +190,7 @@ def window(
             continue
         actions = levers[None]
         if not by_hand:
-            actions, state = policy.predict(obs, state, deterministic=True)
+            actions, state = policy.predict(obs, state, deterministic=deterministic)
         obs, _, terminated, truncated, info = crane.step(actions)
         if terminated[0] or truncated[0]:
             failure = str(info["failure"][0])

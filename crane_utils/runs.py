@@ -195,5 +195,6 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
     weights = saved["weights"]
     bounds = weights["action_low"].numpy(), weights["action_high"].numpy()
     agent = module.Agent(len(weights["obs_mean"]), *bounds, restore_args(module.Args, saved))
-    agent.load_state_dict(agent.state_dict() | weights)  # policy.pt has no critic
-    return agent, saved["task"], script.name
+    critic = {name: w for name, w in agent.state_dict().items() if name.startswith("critic.")}
+    agent.load_state_dict(critic | weights)  # policy.pt has no critic
+    return agent.eval(), saved["task"], script.name

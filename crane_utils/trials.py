@@ -74,8 +74,8 @@ def make_envs(
     for space in (envs.single_observation_space, envs.single_action_space):
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
             raise SystemExit(f"{env_id}: observations and actions must be flat Boxes, not {space}")
-    if space.dtype.kind != "f":
-        raise SystemExit(f"{env_id}: actions must be floats, not {space}")
+    if envs.single_action_space.dtype.kind != "f":
+        raise SystemExit(f"{env_id}: actions must be floats, not {envs.single_action_space}")
     return RecordEpisodeStatistics(CheckFinite(envs))
 
 

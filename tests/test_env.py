@@ -109,6 +109,26 @@ def test_seeds():
     assert not envs.recent_success[0] and not envs.failures[0]
 
 
+@pytest.mark.parametrize("difficulty", [1.0, 0.4])
+def test_a_hook_may_change_a_start_in_place(difficulty):
+    """The repeated start is still the one that failed."""
+
+    class Nearer(CraneVectorEnv):
+        def draw_episode(self, i):
+            q, log_pose, diameter = super().draw_episode(i)
+            q[0] += 0.1
+            log_pose[:2] *= 0.9
+            return q, log_pose, diameter
+
+    envs = Nearer(1, env_threads=1, difficulty=difficulty, retry=1.0)
+    obs = [envs.reset(seed=5)[0]]
+    envs.recent_success[0].append(True)
+    envs.failures[0].append(envs.starts[0])
+    obs += [envs.reset()[0] for _ in range(2)]
+    np.testing.assert_array_equal(obs[1], obs[0])
+    np.testing.assert_array_equal(obs[2], obs[0])
+
+
 def test_difficulty_of_single_cranes():
     """From the next reset on. At 0 the log has the grapple's yaw."""
     envs = gymnasium.vector.SyncVectorEnv([CraneEnv] * 3)

@@ -299,6 +299,11 @@ def test_a_run_is_built_by_the_script_that_made_it(trained, tmp_path):
     agents = [runs.load_policy(path)[0] for path in (trained, other, trained / "policy.pt")]
     kinds = [type(agent.actor[1]) for agent in agents]
     assert kinds == [torch.nn.Tanh, torch.nn.ReLU, torch.nn.Tanh]
+    extra = "self.encoder = nn.Linear(1, 1)\n        self.actor = "
+    wider = text.replace("self.actor = ", extra, 1)
+    (other / "ppo_crane.py").write_text(wider, encoding="utf-8")
+    with pytest.raises(RuntimeError, match="Missing key.*encoder"):  # weights of another network
+        runs.load_policy(other)
     (other / "ppo_crane.py").unlink()  # then the repository's serves
     assert type(runs.load_policy(other)[0].actor[1]) is torch.nn.Tanh
     saved = runs.load(other / "policy.pt")
