@@ -71,8 +71,7 @@ VEL = mujoco.mjtStage.mjSTAGE_VEL  # makes positions, velocities and contacts cu
 SPEED_LIMITS = np.array(  # lowest and highest of q1, q2, q3, q4, q7, q8: rad/s, per stage m/s
     [[-0.764, -0.326, -0.344, -0.630, -2.12, -1.8], [0.802, 0.239, 0.326, 0.400, 2.12, 1.8]]
 )
-JAW_LENGTH = 0.8566  # m, from a jaw's pivot to its tip
-PIVOT_HEIGHT = 0.5  # m, from p_C up to the pivots
+PIVOT_HEIGHT, JAW_LENGTH = 0.5, 0.8566  # m, from p_C up to the jaws' pivots, from there to a tip
 Q8_MAX = 3.0  # rad
 ROTATOR_MAX = 2.8  # rad, 0.34 short of its end stop: as far as the signed angle sends it
 # The engine's joints, before the seven numbers of the log's pose, and our lists of them:
@@ -289,6 +288,12 @@ def centred(miss: Array) -> Array:
 # ---- environments
 
 
+def first(tests: dict[str, Array], otherwise: str) -> Array:
+    """The name of each crane's first true test, (N,) strings."""
+    names, values = np.array([*tests, otherwise]), [*tests.values()]
+    return names[np.argmax([*values, np.ones_like(values[0])], axis=0)]
+
+
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`.
 
@@ -371,9 +376,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
         self.batch = batch = Batch(model, num_envs, env_threads, persistent=True)
-        for field in ("geom_size", "body_mass", "body_inertia"):
-            batch.expand(field)  # each crane has a log of its own
-        # live views of the engine's arrays, one row a crane
+        # live views of the engine's arrays, one row a crane, each with a log of its own
+        sizes, masses, _ = map(batch.expand, ("geom_size", "body_mass", "body_inertia"))
+        self.log_mass = masses[:, model.body("log").id]
+        self.log_radius = sizes[:, model.geom("log").id, 0]
         self.qpos, self.qvel, self.ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         self.act, self.qfrc_bias = batch.bind("act")[:, :8], batch.bind("qfrc_bias")
         self.sensordata = batch.bind("sensordata")
@@ -423,8 +429,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             raise RuntimeError("call reset() before step()")
         if actions.shape != (self.num_envs, 6) or not np.isfinite(actions).all():
             raise ValueError(f"actions must be finite, ({self.num_envs}, 6), got {actions}")
-        actions = np.clip(actions, -1, 1)
-        self.command = actions * speed_limit(actions)
+        self.command = np.clip(actions, -1, 1) * speed_limit(actions)
         diverged = self.simulate()
         self.steps += 1
         state, time = self.state(), self.steps * self.dt
@@ -437,19 +442,17 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # success: each condition held at every step of the last HOLD_TIME
         holds = self.checked(self.conditions(state, info))
         self.streaks = {name: (self.streaks.get(name, 0) + 1) * ok for name, ok in holds.items()}
-        held = {name: streak >= self.hold_steps for name, streak in self.streaks.items()}
-        info["safe"] = np.all([*held.values()], axis=0)
+        missing = first({name: n < self.hold_steps for name, n in self.streaks.items()}, "")
+        info["safe"] = missing == ""
 
         # rules
         rules = self.checked(self.rules(state, info))
-        rules |= {"time_limit": time > self.TIME_LIMIT - 1e-9}
-        ending = np.select([*rules.values()], [*rules], default="none")
+        ending = first(rules | {"time_limit": time > self.TIME_LIMIT - 1e-9}, "none")
         done, truncated = ending != "none", ending == "time_limit"
         terminated = done & ~truncated
         success = info["safe"] & (truncated | np.isin(ending, self.GOALS))
         gentle = success & (self.ground_peak <= GENTLE_FORCE)
-        unmet = [~ok for ok in held.values()]  # in the order of `conditions`
-        failure = np.select([~done | success, terminated, *unmet], ["", ending, *held], default="")
+        failure = np.where(done & ~success, np.where(terminated, ending, missing), "")
         ends = {"success": success, "is_success": success, "gentle": gentle, "failure": failure}
         info |= ends | {"termination": ending}
 
@@ -525,8 +528,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def start_episodes(self, ids: Array) -> None:
         """New episodes in cranes `ids`."""
-        starts = [self.draw_episode(i) for i in ids]
-        q, log_pose, diameter = map(np.array, zip(*starts))
+        q, log_pose, diameter = map(np.array, zip(*map(self.draw_episode, ids)))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
@@ -569,11 +571,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """Write to the engine what differs between episodes: radius (n,) in m, your own bodies."""
         mass = self.density[ids] * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
-        log, capsule = self.batch.body("log"), self.batch.geom("log_capsule")
-        self.batch.geom("log").size[ids, 0] = capsule.size[ids, 0] = radius
+        capsule = self.batch.geom("log_capsule")
+        self.log_radius[ids] = capsule.size[ids, 0] = radius
         capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
-        log.mass[ids, 0] = mass
-        log.inertia[ids] = np.stack([across, across, along], axis=-1)
+        self.log_mass[ids] = mass
+        self.batch.body("log").inertia[ids] = np.stack([across, across, along], axis=-1)
 
     # ---- hooks: what moves the joints
 
@@ -626,10 +628,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         # as in crane.xml; sensors of your own go behind the crane's force on the ground
         parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17, 20], axis=1)
         *poses, touch, log_support, crane_press, _ = parts
-        weight = np.linalg.norm(self.model.opt.gravity) * self.batch.body("log").mass[:, 0]
+        weight = np.linalg.norm(self.model.opt.gravity) * self.log_mass
         ground = np.linalg.norm(log_support, axis=-1) + np.linalg.norm(crane_press, axis=-1)
         carried = np.clip(1 - ground / weight, 0, 1)
-        return CraneState(q, dq, *poses, touch > 0, 2 * self.batch.geom("log").size[:, 0], carried)
+        return CraneState(q, dq, *poses, touch > 0, 2 * self.log_radius, carried)
 
     def bounded_observation(self, state: CraneState, diverged: Array | bool = False) -> Array:
         """`observe` as float32 (N, n), clipped to the space; so are zeros for diverged cranes."""
@@ -666,7 +668,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             "clearance": log_clearance(state),
             "centre_miss": centre_miss(state),
             "diameter": state.diameter,
-            "log_mass": self.batch.body("log").mass[:, 0].copy(),
+            "log_mass": self.log_mass.copy(),
             "ground_peak": self.ground_peak.copy(),
         }
 
@@ -687,14 +689,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         q, (low, high) = state.q, self.joint_range.T
         beyond = (q < low - self.LIMIT_TOLERANCE) | (q > high + self.LIMIT_TOLERANCE)
         away = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
-        too_late = info["time"] > self.REACH_TIME - 1e-9
         return {
             "diverged": info["diverged"],
             # not q8: the jaws' end stops are part of grasping
             **{f"joint_limit_q{k + 1}": beyond[:, k] for k in range(7)},
             "overspeed": (np.abs(state.dq) > 2 * speed_limit(state.dq)).any(axis=-1),
             "log_too_far": away > LOG_RANGE,
-            "not_reached": too_late & np.isinf(self.reach_time),
+            "not_reached": (info["time"] > self.REACH_TIME - 1e-9) & np.isinf(self.reach_time),
         }
 
     def reward_terms(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
@@ -706,10 +707,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         clearance, miss = info["clearance"], info["centre_miss"]
         grasp = self.grasp(state, miss)
         terms = staged_terms(state, distance, clearance, miss, self.command, *grasp)
-        # An easy task forgives hits: a crane that does not lift yet would learn to stay away.
-        weight = self.GROUND_WEIGHT * self.difficulty**4
         hardness = np.clip(2 * self.impact / GENTLE_FORCE - 1, 0, self.GROUND_MOST)
-        return terms | {"r_ground": -weight * hardness}
+        # An easy task forgives hits: a crane that does not lift yet would learn to stay away.
+        return terms | {"r_ground": -self.GROUND_WEIGHT * self.difficulty**4 * hardness}
 
     def grasp(self, state: CraneState, miss: Array) -> tuple[Array, Array]:
         """closed and grip of `staged_terms`."""

@@ -46,7 +46,7 @@ def caption(crane: CraneVectorEnv, driver: str, metrics: Metrics, failure: str |
     else:  # the log is off the ground
         conditions_hold = all(streak[0] > 0 for streak in crane.streaks.values())
         phase = "holding" if conditions_hold else "lifting"
-    mass = crane.batch.body("log").mass[0, 0]
+    mass = crane.log_mass[0]
     return {
         "log": f"{state.diameter[0]:.2f} m, {mass:.0f} kg",
         "driver": driver,
