@@ -289,7 +289,7 @@ def centred(miss: Array) -> Array:
 
 
 def first(tests: dict[str, Array], otherwise: str) -> Array:
-    """The name of each crane's first true test, (N,) strings."""
+    """The name of each crane's first true test, `otherwise` where none is true, (N,) strings."""
     names, values = np.array([*tests, otherwise]), [*tests.values()]
     return names[np.argmax([*values, np.ones_like(values[0])], axis=0)]
 
@@ -376,7 +376,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
 
         self.batch = batch = Batch(model, num_envs, env_threads, persistent=True)
-        # live views of the engine's arrays, one row a crane, each with a log of its own
+        # live views of the engine's arrays, one row a crane. Each has a log of its own
         sizes, masses, _ = map(batch.expand, ("geom_size", "body_mass", "body_inertia"))
         self.log_mass = masses[:, model.body("log").id]
         self.log_radius = sizes[:, model.geom("log").id, 0]
