@@ -33,7 +33,7 @@ from crane_env import STRICT, Options
 from crane_utils import runs, trials
 from crane_utils.runs import Count, Factor, Share
 
-A_MIN = 1e-4  # executed a_n lie in [A_MIN, 1 - A_MIN]: the log-probability is -inf at 0 and 1
+A_MIN = 1e-4  # in training a_n is in [A_MIN, 1 - A_MIN]: the log-probability is -inf at 0 and 1
 PERTURBED = 0.4  # share of the run in which eps falls to 0
 LOG_EXCESS_MAX = 5.0  # bound of log(alpha - 1) and log(beta - 1)
 
@@ -55,7 +55,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; 0 to 0.005 is the task's own, as in evaluations
+    physics_step: Factor = 0.01  # s, in training; up to 0.005, or above a step: the task's own
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -100,8 +100,8 @@ class Agent(nn.Module):
         self.actor = mlp([obs_dim, *args.hidden_sizes, 2 * len(action_low)], last_gain=0.01)
         nn.init.constant_(self.actor[-1].bias, args.log_excess_init)
         self.critic = mlp([obs_dim, *args.hidden_sizes, 1], last_gain=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low))
-        self.register_buffer("action_high", torch.as_tensor(action_high))
+        self.register_buffer("action_low", torch.tensor(action_low))
+        self.register_buffer("action_high", torch.tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))

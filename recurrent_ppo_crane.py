@@ -59,7 +59,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; 0 to 0.005 is the task's own, as in evaluations
+    physics_step: Factor = 0.01  # s, in training; up to 0.005, or above a step: the task's own
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -97,7 +97,7 @@ def mlp(sizes: list[int], last_gain: float) -> nn.Sequential:
 
 
 class Agent(nn.Module):
-    """Actor, critic and observation normalizer. The networks take normalized observations."""
+    """LSTM, actor, critic, observation normalizer. Actor and critic take what `remember` gives."""
 
     def __init__(self, obs_dim: int, action_low: np.ndarray, action_high: np.ndarray, args: Args):
         super().__init__()
@@ -106,8 +106,8 @@ class Agent(nn.Module):
         self.actor = mlp([features, *args.hidden_sizes, len(action_low)], last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
         self.critic = mlp([features, *args.hidden_sizes, 1], last_gain=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low))
-        self.register_buffer("action_high", torch.as_tensor(action_high))
+        self.register_buffer("action_low", torch.tensor(action_low))
+        self.register_buffer("action_high", torch.tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))

@@ -63,7 +63,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 128  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; 0 to 0.005 is the task's own, as in evaluations
+    physics_step: Factor = 0.01  # s, in training; up to 0.005, or above a step: the task's own
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -109,8 +109,8 @@ class Agent(nn.Module):
         self.actor = mlp([obs_dim, *args.hidden_sizes, len(action_low)], last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((len(action_low),), args.log_std_init))
         self.critic = mlp([obs_dim, *args.hidden_sizes, 1], last_gain=1.0)
-        self.register_buffer("action_low", torch.as_tensor(action_low))
-        self.register_buffer("action_high", torch.as_tensor(action_high))
+        self.register_buffer("action_low", torch.tensor(action_low))
+        self.register_buffer("action_high", torch.tensor(action_high))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_var", torch.ones(obs_dim, dtype=torch.float64))
         self.register_buffer("obs_count", torch.tensor(0.0, dtype=torch.float64))
@@ -181,7 +181,7 @@ def fisher_vector_product(agent: Agent, obs: Tensor, damping: float) -> Callable
 def conjugate_gradient(matvec: Callable[[Tensor], Tensor], b: Tensor, iterations: int) -> Tensor:
     """Roughly x with matvec(x) = b, for a symmetric positive definite matrix."""
     x, residual = torch.zeros_like(b), b.clone()
-    direction, residual_sq = b.clone(), b @ b
+    direction, residual_sq = b, b @ b
     for _ in range(iterations):
         if residual_sq <= 1e-20 * (b @ b):
             break
@@ -207,10 +207,10 @@ def surrogate_and_kl(
 def line_search(
     agent: Agent, full_step: Tensor, batch: tuple, delta: float, args: Args
 ) -> tuple[float, float, float]:
-    """Move the policy along full_step. Returns the accepted fraction, the KL and the improvement.
+    """Move the policy along full_step. Returns the accepted fraction, its KL and its E[rho A].
 
     batch: obs, actions, advantages and old policy, as `surrogate_and_kl` takes them. If no fraction
-    is accepted, the policy stays as it was and all three are 0.
+    is accepted, the policy stays as it was, and the first two are 0.
     """
     old_surrogate, _ = surrogate_and_kl(agent, *batch)
     start = flat(agent.policy_parameters())
@@ -219,9 +219,9 @@ def line_search(
         nn.utils.vector_to_parameters(start + fraction * full_step, agent.policy_parameters())
         surrogate, kl = surrogate_and_kl(agent, *batch)
         if kl <= delta and surrogate > old_surrogate:
-            return fraction, kl.item(), (surrogate - old_surrogate).item()
+            return fraction, kl.item(), surrogate.item()
     nn.utils.vector_to_parameters(start, agent.policy_parameters())
-    return 0.0, 0.0, 0.0
+    return 0.0, 0.0, old_surrogate.item()
 
 
 def compute_gae(
@@ -328,9 +328,9 @@ if __name__ == "__main__":
         curvature = direction @ fisher_vector_product(agent, b_obs, args.cg_damping)(direction)
         delta = left * args.target_kl
         full_step = torch.sqrt(2 * delta / (curvature + 1e-12)) * direction
-        fraction, kl, improvement = line_search(agent, full_step, batch, delta, args)
+        fraction, kl, reached = line_search(agent, full_step, batch, delta, args)
         stats = defaultdict(list)
-        stats["losses/policy_loss"] = [-(surrogate.item() + improvement)]
+        stats["losses/policy_loss"] = [-reached]
         stats["losses/entropy"] = [old.entropy().sum(-1).mean().item()]
         stats["policy/std"] = [old.stddev.mean().item()]
         stats["losses/approx_kl"], stats["trpo/step_fraction"] = [kl], [fraction]

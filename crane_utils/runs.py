@@ -5,7 +5,6 @@ checkpoint.pt to resume from, and a copy of the script that wrote them.
 """
 
 import argparse
-import contextlib
 import importlib.util
 import os
 import shutil
@@ -61,8 +60,8 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     if checkpoint:
-        # These shape networks and rollouts.
-        for name in ("env_id", "num_envs", "num_steps", "hidden_sizes", "lstm_size"):
+        fixed = ["env_id", "num_envs", "num_steps", "hidden_sizes", "lstm_size"]  # shapes
+        for name in [*fixed, "log_std_init", "log_excess_init"]:  # the checkpoint has the width
             if getattr(args, name, None) != (was := getattr(default, name, None)):
                 raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
         cranes, was = trials.crane_class(args.env_id), checkpoint["task"].get("revision")
@@ -102,8 +101,7 @@ def restore(
 def make_folder(args: Any) -> Path:
     """The run's folder: that of --resume, or a new one with a copy of the script."""
     if args.resume:
-        with contextlib.suppress(shutil.SameFileError):
-            shutil.copy(sys.argv[0], args.resume)  # it may have been edited since
+        shutil.copy(sys.argv[0], args.resume / "script.unfinished")  # perhaps edited: see `save`
         return args.resume
     # two runs that start together, also in containers, get two folders
     name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{token_hex(2)}"
@@ -123,6 +121,8 @@ def save(
     run["task"] = {"env_id": args.env_id, **getattr(crane, "task", {})}
     acting = {name: w for name, w in weights.items() if not name.startswith("critic.")}
     resuming = {"optimizer": optimizer.state_dict(), "iteration": iteration}
+    if (edited := folder / "script.unfinished").exists():  # its first weights, after --resume
+        os.replace(edited, folder / run["script"])
     write(folder / "policy.pt", run | {"weights": acting})
     write(folder / "checkpoint.pt", run | {"weights": weights} | resuming)
 
@@ -131,6 +131,7 @@ def write(path: Path, contents: dict[str, Any]) -> None:
     """Write a file whole or not at all: a kill or a full disk leaves the old one."""
     unfinished = path.with_suffix(".unfinished")
     torch.save(contents, unfinished)
+    load(unfinished)  # it refuses what torch.save takes, as paths or NumPy's numbers
     os.replace(unfinished, path)
 
 

@@ -150,14 +150,14 @@ def run_trials(
         actions, state = policy.predict(obs, state, deterministic=deterministic)
         obs, reward, terminated, truncated, info = envs.step(actions)
         values = {} if metrics is None else metrics.after_step(info)
-        first = (terminated | truncated) & ~ended  # later ends belong to other episodes
-        if step == MAX_STEPS - 1:
-            print(f"{(~ended).sum()} episodes have no end in {MAX_STEPS:,} steps", file=sys.stderr)
+        done = terminated | truncated
+        first = done & ~ended  # later ends belong to other episodes
+        if step == MAX_STEPS - 1 and (endless := ~done & ~ended).any():
+            print(f"{endless.sum()} episodes have no end in {step + 1:,} steps", file=sys.stderr)
             first = ~ended
         if first.any():
             numbers = {k: v for k, v in info.items() if isinstance(v, Array) and v.ndim == 1}
             values |= {k: v for k, v in numbers.items() if k[0] != "_" and v.dtype != object}
-            done = terminated | truncated
             finished = info["episode"]["r"] if done.any() else 0.0
             values["episodic_return"] = np.where(done, finished, envs.episode_returns)
             for name, value in values.items():

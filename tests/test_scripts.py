@@ -3,6 +3,7 @@
 import importlib
 import io
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -272,6 +273,8 @@ def test_a_killed_run_goes_on(tmp_path):
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     runs.write(tmp_path / "policy.pt", {"good": 1})
+    with pytest.raises(pickle.UnpicklingError):  # now, and not when the run is resumed
+        runs.write(tmp_path / "policy.pt", {"good": np.float64(2)})
     save = torch.save
 
     def full_disk(contents, path):
@@ -283,6 +286,18 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(OSError):
         runs.write(tmp_path / "policy.pt", {"good": 2})
     assert runs.load(tmp_path / "policy.pt") == {"good": 1}
+
+
+def test_an_edited_script_joins_a_resumed_run_with_its_first_weights(tmp_path, monkeypatch):
+    (folder := tmp_path / "run").mkdir()
+    (copy := folder / "mine.py").write_text("old", encoding="utf-8")
+    (script := tmp_path / "mine.py").write_text("edited", encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", [str(script)])
+    args, agent = importlib.import_module("ppo_crane").Args(resume=folder), torch.nn.Linear(1, 1)
+    assert runs.make_folder(args) == folder and copy.read_text(encoding="utf-8") == "old"
+    envs, optimizer = SimpleNamespace(unwrapped=None), torch.optim.Adam(agent.parameters())
+    runs.save(folder, args, envs, agent, optimizer, 1)
+    assert copy.read_text(encoding="utf-8") == "edited"
 
 
 def test_a_second_ctrl_c_stops_at_once_and_nohup_is_respected():

@@ -244,5 +244,5 @@ def test_line_search_restores_exactly_what_it_cannot_improve(factor):
     gradient = module.flat(torch.autograd.grad(surrogate, agent.policy_parameters()))
     before = module.flat(agent.policy_parameters()).detach()
     step, args = factor * gradient, module.Args()
-    assert module.line_search(agent, step, batch, 0.01, args) == (0.0, 0.0, 0.0)
+    assert module.line_search(agent, step, batch, 0.01, args) == (0.0, 0.0, surrogate.item())
     assert torch.equal(before, module.flat(agent.policy_parameters()))
