@@ -1,15 +1,13 @@
 """A forestry crane that grasps and lifts a log: the MuJoCo simulator and Gymnasium environment.
 
-    import gymnasium
     env = gymnasium.make("crane_env:ForestryCrane-v0")                    # one crane: CraneEnv
     envs = gymnasium.make_vec("crane_env:ForestryCrane-v0", num_envs=64)  # many: CraneVectorEnv
 
 The crane slews at q1, lifts at q2 (boom) and q3 (arm) and reaches with q4 (two equal telescope
 stages). Two passive joints q5 and q6 let the grapple hang: a rotator q7 with two jaws q8. A log
 lies somewhere in front of the crane. Within 6 s the grapple must reach it. At the end of the 9 s it
-must hang in the jaws. Section and equation names refer to Vu et al., "Towards Autonomous Wood-Log
-Grasping with a Forestry Crane: Simulator and Benchmarking". assets/README.md has the source of
-every number, docs/environment.md the task on one page.
+must hang in the jaws. Sections and equations are those of Vu et al. (README.md). assets/README.md
+has the source of every number, docs/environment.md the task on one page.
 
 Observation, float32, `Box` of shape (18,):
 
@@ -323,8 +321,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
     LIMIT_TOLERANCE = 0.02  # rad, m; at full servo force a soft stop gives 0.005 rad or 0.012 m
     GOALS: tuple[str, ...] = ()  # names of `rules` that end an episode well where it is `safe`
-    COARSE_INTEGRATOR = mujoco.mjtIntegrator.mjINT_DISCRETE  # of a larger physics_step
-    COARSE_HITS = 0.0  # forces of hits count times (larger / exact step)^this (docs/training.md)
+    COARSE_HITS = 0.5  # forces of hits count times (larger / exact step)^this (docs/training.md)
     PIECE = 0.025  # s between two clamps of the integrators (assets/README.md)
     # In the full task r_ground falls linearly from 0 at half of GENTLE_FORCE to -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
@@ -366,11 +363,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if self.options.contact == "primitive" and spec.option.timestep < physics_step <= self.dt:
             self.frame_skip = int(np.ceil(self.dt / physics_step - 1e-9))
             spec.option.timestep = self.dt / self.frame_skip
-            spec.option.integrator = self.COARSE_INTEGRATOR
-        self.hit_factor = (self.options.frame_skip / self.frame_skip) ** self.COARSE_HITS
+        self.coarse = self.options.frame_skip / self.frame_skip  # 1, or longer by this factor
         self.piece = int(np.ceil(self.PIECE / spec.option.timestep - 1e-9))  # physics steps
         spec.sensor("ground_force").nsample = self.piece
         self.model = model = spec.compile()
+        # kv: a servo at its force limit overshoots more in a longer step, and would chatter
+        model.actuator_gainprm[:8, 0] /= self.coarse
+        model.actuator_biasprm[:8, 2] /= self.coarse
         self.max_steps = int(np.ceil(self.TIME_LIMIT / self.dt - 1e-9))
         self.hold_steps = int(np.floor(self.HOLD_TIME / self.dt + 1e-9)) + 1  # both ends count
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
@@ -406,7 +405,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def history(self, name: str) -> Array:
-        """Live values of a sensor in its last `nsample` physics steps, (N, nsample x size)."""
+        """Live values of a sensor at its last `nsample` physics steps, in no order, (N, any)."""
         i = self.model.sensor(name).id
         n = self.model.sensor_history[i, 0]
         start = self.model.sensor_historyadr[i] + 2 + n  # behind the times of the samples
@@ -487,7 +486,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return values
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
-        """New episodes. seed: one for all (crane i draws from its i-th child), or one per crane."""
+        """New episodes of all cranes, from one seed (crane i draws from its i-th child) or N."""
         if seed is not None or self.rngs is None:
             if np.ndim(seed) == 0:  # one, or None
                 seed = SeedSequence(seed).spawn(self.num_envs)
@@ -528,20 +527,21 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def start_episodes(self, ids: Array) -> None:
         """New episodes in cranes `ids`."""
+        for i in ids:
+            self.noise[i] = self.rngs[i][1].uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
         q, log_pose, diameter = map(np.array, zip(*map(self.draw_episode, ids)))
         if self.fixed_diameter is not None:
             diameter = self.fixed_diameter[ids]
         self.place(ids, q, log_pose, diameter)
 
     def draw_episode(self, i: int) -> tuple[Array, Array, float]:
-        """Draw crane i's next start, as `sample_start` gives it, and its pose errors."""
-        (start_rng, noise_rng, _), failures = self.rngs[i], self.failures[i]
+        """Draw crane i's next start, as `sample_start` gives it."""
+        (start_rng, *_), failures = self.rngs[i], self.failures[i]
         share = self.retry * np.mean(self.recent_success[i] or 0.0)  # 0 at first
         if share and failures and start_rng.random() < share:
             self.starts[i] = failures[start_rng.integers(len(failures))]
         else:
             self.starts[i] = *sample_start(start_rng), {}  # {}: what a subclass draws with it
-        self.noise[i] = noise_rng.uniform(-POSE_NOISE, POSE_NOISE, self.noise[i].shape)
         start = tuple(np.copy(part) for part in self.starts[i][:3])  # hooks may change it in place
         difficulty = self.difficulty / self.FULL_STARTS
         return ease_start(*start, difficulty) if difficulty < 1 else start
@@ -606,7 +606,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                     observer(self)
             ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1)
             ground[self.warned()] = 0.0  # the engine has reset them
-            self.impact = np.maximum(self.impact, self.hit_factor * ground.max(axis=-1))
+            self.impact = np.maximum(self.impact, self.coarse**self.COARSE_HITS * ground.max(-1))
             self.ground_peak = np.maximum(self.ground_peak, self.impact)
         finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
         return failed | self.warned() | ~finite
@@ -649,9 +649,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def observe(self, state: CraneState) -> Array:
         """Observations (N, n). A subclass adds columns, and their limits to observation_limits."""
-        delta_p, delta_psi, angle = relative_pose(state, self.options.offset)
-        if not self.options.signed_yaw:
-            angle = delta_psi
+        delta_p, delta_psi, signed_angle = relative_pose(state, self.options.offset)
+        angle = signed_angle if self.options.signed_yaw else delta_psi
         if self.options.pose_noise != "none":
             now = np.minimum(self.steps, self.noise.shape[1] - 1)
             delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
@@ -691,8 +690,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         away = np.linalg.norm(state.log_centre - state.grapple_centre, axis=-1)
         return {
             "diverged": info["diverged"],
-            # not q8: the jaws' end stops are part of grasping
-            **{f"joint_limit_q{k + 1}": beyond[:, k] for k in range(7)},
+            **{f"joint_limit_q{k + 1}": beyond[:, k] for k in range(7)},  # jaws may use their stops
             "overspeed": (np.abs(state.dq) > 2 * speed_limit(state.dq)).any(axis=-1),
             "log_too_far": away > LOG_RANGE,
             "not_reached": (info["time"] > self.REACH_TIME - 1e-9) & np.isinf(self.reach_time),

@@ -116,7 +116,7 @@ BUILT_IN = {
 
 LEGEND = """\
 Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. The other
-columns are of the successes: means of reach (until d_combine < 0.35 m) and miss (from grip to log
+columns are of the successes: means of reach (until the log is reached) and miss (from grip to log
 centre), medians of the others. Up: when all conditions of success had held for 0.5 s."""
 PAPERS = " The paper's rule is weaker. Its training took 500 million physics steps."
 
@@ -143,7 +143,7 @@ def task_of(policy: Any, trained: dict, args: Args, flags: list[str]) -> tuple[s
         raise SystemExit(f"{env_id} is not the crane: its vector_entry_point is no CraneVectorEnv")
     default = trials.task_options(env_id)
     if "options" in trained and not args.env_id:
-        default = cranes.Options(**trained["options"])
+        default = cranes.Options(**asdict(default) | trained["options"])
     config = (tyro.conf.FlagConversionOff,)
     options = tyro.cli(TaskArgs, args=flags, default=TaskArgs(env=default), config=config).env
     differs = {
@@ -173,7 +173,6 @@ def describe(observations: int, low: Any, high: Any) -> str:
 
 def play(policy: Any, env_id: str, options: Options, args: Args) -> Iterator[dict]:
     """Yields a row a trial: diameter (m), trial (its number), and KEPT."""
-    torch.manual_seed(args.seed)
     diameters, seeds = trials.monte_carlo_trials(args.seed, args.trials, args.diameters)
     with tqdm(total=len(seeds), unit="trial", leave=False, disable=args.json) as bar:
         for start in range(0, len(seeds), CRANES):
@@ -235,8 +234,8 @@ def main() -> None:
         description=summary + " --env.NAME changes an option of the task, as in the training.",
         return_unknown_args=True,
     )
-    if args.csv and (args.video or args.viewer):
-        raise SystemExit("--csv has a row for each evaluated trial: leave out --video and --viewer")
+    if (args.csv or args.json) and (args.video or args.viewer):
+        raise SystemExit("--csv and --json are for evaluations: leave out --video and --viewer")
     if args.video and len(args.policies) > 1:
         raise SystemExit("--video films one policy")
     torch.set_num_threads(1)  # the batches are too small for more
@@ -250,6 +249,7 @@ def main() -> None:
     file = args.csv and open(args.csv, "w", encoding="utf-8", newline="")
     overall = {}
     for name, label, policy, env_id, options in evaluated:
+        torch.manual_seed(args.seed)
         scene = {"seed": args.seed, "trial": args.trial, "camera": args.camera}
         scene["deterministic"] = not args.stochastic
         if args.viewer:

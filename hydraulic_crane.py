@@ -37,7 +37,6 @@ DAMPING = np.array([1.12e4, 6.63e4, 3.88e4, 9.4e3, 757.0, 3.4e3])  # N m s/rad, 
 LAG = np.array([0.007, 0.026, 0.069, 0.008, 0.130, 0.130])  # s, of the valve, first order
 DEAD_TIME = np.array([0.117, 0.080, 0.044, 0.060, 0.058, 0.058])  # s
 BREAKAWAY = 0.10  # s that the load-holding valve of a resting telescope takes to open
-MAX_DELAY = 32  # physics steps that the engine remembers commands for the dead time
 PRESSURE = 25e6  # Pa, the pump's; no cylinder pushes harder than its area times this
 MIN_LEVER = 0.05  # m; below q2 = -1.13 rad the boom's computed lever is smaller or negative
 # Oil per joint movement at -1 and +1, m^3/rad, m^3/m; of q2 and q3 per metre of their cylinders.
@@ -135,7 +134,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
 
     Options = Options
     REVISION = 8
-    COARSE_INTEGRATOR, COARSE_HITS = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 0.7
+    COARSE_HITS = 0.7
     PIECE = 0.02  # s between two looks of the valves at the command
     PUMP_FLOW = 0.95 * 1.4e-3  # m^3/s, shared by all joints (assets/README.md)
     GROUND_WEIGHT, GROUND_MOST = 90.0, 3.0
@@ -160,11 +159,11 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
         spec = super().make_spec()
         for index, action in zip(SERVOS, ACTION_OF_SERVO):
             joint = spec.joints[index]
-            joint.damping[0] = DAMPING[action]
             spec.actuator(joint.name).gainprm[0] = spec.actuator(joint.name).biasprm[2] = 0
             spring = spec.actuator(f"{joint.name}_integral")
-            spring.gainprm[0], spring.biasprm[1] = STIFFNESS[action], -STIFFNESS[action]
-            spring.delay, spring.nsample = DEAD_TIME[action], MAX_DELAY
+            spring.delay = DEAD_TIME[action]
+            longest = DEAD_TIME[action] + DRAWN["extra_delay"][2]
+            spring.nsample = int(longest / spec.option.timestep) + 2  # commands that it remembers
             spring.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             spring.forcerange = joint.actfrcrange
         return spec

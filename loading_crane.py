@@ -181,7 +181,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         }
 
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """not_lifted: LIFT_TIME is over. log_lost: a lifted log is let go beside the bunk."""
+        """not_lifted: after LIFT_TIME. log_lost: loose beside the bunk, low or for HOLD_TIME."""
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
         self.loose = np.where(self.on_log > 0, 0, self.loose + 1)

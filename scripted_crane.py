@@ -167,11 +167,12 @@ def bounded(vector: np.ndarray, length: float) -> np.ndarray:
 class ScriptedCrane:
     """Maps observations (N, 18 or more) of ForestryCrane-v0 to actions (N, 6).
 
-    settings: None takes the second of `drives` for 32 or more numbers, as hydraulic drives have
-    them, else the first.
+    settings: None takes the second of `drives` where observations have the column SLEW_FORCE, as
+    those of hydraulic drives with `sensors`, else the first.
     """
 
     drives = IDEAL, HYDRAULIC
+    SLEW_FORCE = 26  # column of the force of the slew's oil
 
     def __init__(self, settings: Settings | None = None):
         self.settings = settings
@@ -183,7 +184,7 @@ class ScriptedCrane:
     ) -> tuple[np.ndarray, "ScriptedCrane"]:
         """Actions (N, 6) and the memory of this batch of trials. None starts new trials."""
         if state is None:
-            settings = self.settings or self.drives[obs.shape[1] >= 32]
+            settings = self.settings or self.drives[obs.shape[1] > self.SLEW_FORCE]
             state = type(self)(settings)
             state.start(len(obs))
         return state.act(obs), state
@@ -243,8 +244,8 @@ class ScriptedCrane:
 
         task = np.concatenate([self.velocity, yaw_rate[:, None]], axis=-1)
         rates = SPEED * damped_least_squares(plumb_jacobian(plumb_frames) * SPEED, task, DAMPING)
-        if obs.shape[1] >= 32:  # its last six are the forces of the oil
-            rates[:, 0] -= settings.relief * obs[:, -6]
+        if obs.shape[1] > self.SLEW_FORCE:
+            rates[:, 0] -= settings.relief * obs[:, self.SLEW_FORCE]
         fractions = np.where(rates < 0, -rates / LOW, rates / HIGH)
         # too fast for a joint: all slow down and the direction stays; the rotator alone is clipped
         fractions /= np.maximum(1.0, np.abs(fractions[:, :4]).max(axis=-1, keepdims=True))

@@ -70,7 +70,8 @@ class ChangedCranes(HydraulicCraneVectorEnv):
         for index in SERVOS:
             joint = spec.joints[index]
             drive = spec.actuator(f"{joint.name}_integral")
-            drive.delay, drive.nsample = drive.delay + self.delay, 2 * drive.nsample
+            drive.delay += self.delay
+            drive.nsample += int(self.delay / spec.option.timestep) + 1
         angle, g = np.radians(self.slope), spec.option.gravity[2]
         spec.option.gravity = [-g * np.sin(angle), 0, g * np.cos(angle)]
         if self.slope:

@@ -45,14 +45,14 @@ def caption(crane: CraneVectorEnv, driver: str, metrics: Metrics, failure: str |
         phase = "gripping" if np.isfinite(crane.reach_time[0]) else "reaching"
     else:  # the log is off the ground
         conditions_hold = all(streak[0] > 0 for streak in crane.streaks.values())
-        phase = "holding" if conditions_hold else "lifting"
+        phase = "safe" if conditions_hold else "lifting"
     mass = crane.log_mass[0]
     return {
         "log": f"{state.diameter[0]:.2f} m, {mass:.0f} kg",
         "driver": driver,
         "time": f"{crane.batch.time[0]:.1f} s",
         "phase": phase,
-        "force on ground": f"{crane.ground_peak[0] / 1e3:.0f} kN at most",
+        "hardest hit": f"{crane.ground_peak[0] / 1e3:.0f} kN",
         "oil": f"{metrics.values['litres'][0]:.1f} l",
     }
 

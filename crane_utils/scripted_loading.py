@@ -92,6 +92,7 @@ class ScriptedLoadingCrane(ScriptedCrane):
     """
 
     drives = LOADING_IDEAL, LOADING_HYDRAULIC
+    SLEW_FORCE = 31
 
     def start(self, cranes: int) -> None:
         super().start(cranes)

@@ -129,6 +129,16 @@ def test_a_hook_may_change_a_start_in_place(difficulty):
     np.testing.assert_array_equal(obs[2], obs[0])
 
 
+def test_a_start_of_ones_own_still_has_pose_errors():
+    class Own(CraneVectorEnv):
+        def draw_episode(self, i):
+            return crane_env.sample_start(self.rngs[i][2])
+
+    envs = Own(2, env_threads=1, pose_noise="step")
+    envs.reset(seed=0)
+    assert (0 < np.abs(envs.noise).max(axis=(1, 2))).all()
+
+
 def test_difficulty_of_single_cranes():
     """From the next reset on. At 0 the log has the grapple's yaw."""
     envs = gymnasium.vector.SyncVectorEnv([CraneEnv] * 3)
@@ -442,6 +452,22 @@ def test_coarser_physics_feels_hits_as_hard(cranes):
             envs.step(np.tile([0, -0.5, 0, 0, 0, 0], (32, 1)))
     ratio = np.median(fine.ground_peak) / np.median(coarse.ground_peak)
     assert 0.8 < ratio < 1.2 and np.median(fine.ground_peak) > GENTLE_FORCE
+
+
+def test_coarser_physics_does_not_chatter():
+    """A stiff servo at its force limit overshoots, back and forth, when commands change."""
+    envs, fast = CraneVectorEnv(16, env_threads=1, physics_step=0.01), []
+
+    def watch(envs):
+        speed = envs.state().dq
+        fast.append(np.abs(speed) > 2 * crane_env.speed_limit(speed))
+
+    envs.observers.append(watch)
+    envs.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(15):
+        envs.step(rng.uniform(-0.6, 0.6, (16, 6)))
+    assert np.mean(fast) < 0.003
 
 
 def test_sdf_contacts_keep_their_physics_step():

@@ -72,7 +72,7 @@ def test_the_caption_names_the_phase():
         envs.batch.forward()
         phases.append(film.caption(envs, "mine", metrics, None)["phase"])
     phases += [film.caption(envs, "mine", metrics, end)["phase"] for end in ("not_held", "")]
-    assert phases == ["reaching", "gripping", "lifting", "holding", "failed: not held", "success"]
+    assert phases == ["reaching", "gripping", "lifting", "safe", "failed: not held", "success"]
 
 
 def test_the_window_shows_the_trials_that_are_evaluated(monkeypatch):

@@ -49,6 +49,17 @@ def test_nothing_moves_within_the_dead_time():
     assert (moved > late).all() and (moved <= late + 0.03).all()
 
 
+@pytest.mark.parametrize("step", [0.005, 0.01])
+def test_a_longer_dead_time_is_not_cut(step, monkeypatch):
+    monkeypatch.setattr(hydraulic, "DEAD_TIME", np.full(6, 0.3))
+    envs = standing(0.8, 0.3, 0.5, 0.3, frame_skip=2, physics_step=step)
+    before = envs.act[0, 0]
+    hold(envs, np.eye(6)[0], 29)
+    assert envs.act[0, 0] == pytest.approx(before, abs=1e-9)
+    hold(envs, np.eye(6)[0], 4)
+    assert envs.act[0, 0] > before + 1e-3
+
+
 def test_levers_of_the_cylinders():
     """The arm's is that of the drawn cylinder; the boom's never vanishes where it can go."""
     model = CraneVectorEnv(1, render_mode="rgb_array").model

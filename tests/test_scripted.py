@@ -8,6 +8,7 @@ import pytest
 import scripted_crane as scripted
 from crane_env import CraneVectorEnv
 from crane_utils.metrics import Metrics
+from crane_utils.scripted_loading import ScriptedLoadingCrane
 from crane_utils.trials import make_envs, monte_carlo_trials, run_trials
 from hydraulic_crane import HydraulicCraneVectorEnv
 from scripted_crane import HYDRAULIC, ScriptedCrane
@@ -43,6 +44,19 @@ def test_it_grasps_and_lifts():
     envs = make_envs("ForestryCrane-v0", 12, 1, {"diameter": diameters})
     results = run_trials(ScriptedCrane(), envs, seeds)
     assert results["success"].all() and results["gentle"].all(), results
+
+
+@pytest.mark.parametrize("task", ["ForestryCraneHydraulic-v0", "ForestryCraneHydraulicLoading-v0"])
+def test_numbers_that_a_task_appends_change_nothing(task):
+    obs, _ = make_envs(task, 6).reset(seed=0)
+    policy = ScriptedCrane() if "Loading" not in task else ScriptedLoadingCrane()
+    forces = obs[:, policy.SLEW_FORCE : policy.SLEW_FORCE + 6]
+    assert forces.shape[1] == 6 and np.abs(forces[:, 0]).max() < 1.0  # of its limit
+    obs[:, policy.SLEW_FORCE] = 0.5
+    more = np.column_stack([obs, np.full((6, 3), 0.9)])
+    np.testing.assert_array_equal(policy.predict(more)[0], policy.predict(obs)[0])
+    obs[:, policy.SLEW_FORCE] = -0.5
+    assert (policy.predict(more)[0][:, 0] != policy.predict(obs)[0][:, 0]).all()
 
 
 def test_a_slew_that_yields_to_the_force_of_its_oil_does_not_swing_on():
