@@ -137,14 +137,14 @@ def main() -> None:
     os.environ |= {"OMP_NUM_THREADS": str(args.threads), "GOMP_SPINCOUNT": "5000"}
     for seed, name, setting in tqdm([*product(args.seeds, args.rivals, args.settings)]):
         key = {"rival": name, "setting": setting, "seed": seed, "budget": args.minutes}
-        key, known = {name: str(value) for name, value in key.items()}, read_rows(args.results)
-        if any(key.items() <= row.items() for row in known):
+        key = {name: str(value) for name, value in key.items()}
+        if any(key.items() <= row.items() for row in read_rows(args.results)):
             continue
         tqdm.write(" ".join(key.values()))
         clock = time.monotonic(), args.minutes, args.threads
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
             row = pool.submit(train, name, setting, seed, *clock).result()
-        write_rows(args.results, [*known, key | row])
+        write_rows(args.results, [*read_rows(args.results), key | row])
 
 
 if __name__ == "__main__":

@@ -101,8 +101,8 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
     trials = key["per_diameter"]
     key |= {"trial_seed": REPORT_SEED, "trials": 6 * trials}
     key = {name: str(value) for name, value in key.items()}
-    known, options = read_rows(path), protocol.task_options(env_id)
-    if any(key.items() <= row.items() for row in known):
+    options = protocol.task_options(env_id)
+    if any(key.items() <= row.items() for row in read_rows(path)):
         return
     if hasattr(options, "sensors"):
         options = replace(options, sensors=sensors)
@@ -115,7 +115,7 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
         line["held"] = 100 * np.mean([a["success"] and b["success"] for a, b in zip(rows, later)])
     for name in ("success", *(["held"] if then else []), "gentle", *METRICS):
         key[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
-    write_rows(path, [*known, key | {"failures": line["failures"]}])
+    write_rows(path, [*read_rows(path), key | {"failures": line["failures"]}])
 
 
 def levels(trials: int = 100, folder: Path = RESULTS) -> None:

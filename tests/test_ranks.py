@@ -85,6 +85,10 @@ def check_updates(ranks, saved):
             ours = update["weights"][name].double()
             torch.testing.assert_close(ours, weights, rtol=1e-5, atol=1e-5)
         assert scalars["charts/learning_rate"][(k + 1) * N * STEPS] == pytest.approx(reference.lr)
+        drawn = torch.stack(ranks[0]["samples"][k * STEPS : (k + 1) * STEPS])
+        epsilon, noise = 0.1 * (1 - k / 9 / 0.4), (update["actions"] - drawn).abs().max()
+        assert 0.8 * epsilon < noise <= epsilon + 1e-6
+        assert update["difficulty"] == pytest.approx((k + 1) / 9 / 0.5)
     assert [done, done] == [len(rank["permutations"]) for rank in ranks]
     assert min(epochs_done) < max(epochs_done)
     seen = np.concatenate(reference.seen)

@@ -271,6 +271,23 @@ def test_a_killed_run_goes_on(tmp_path):
     assert "gamma: 0.97" in str(events.Tensors("hyperparameters/text_summary"))
 
 
+@pytest.mark.parametrize("script", ALGORITHMS)
+def test_every_tenth_update_is_kept(tmp_path, monkeypatch, script):
+    step, count = Toy.step, []
+
+    def deadly(env, action):
+        count.append(1)
+        if len(count) == 12 * UPDATE + 5:
+            raise MemoryError
+        return step(env, action)
+
+    monkeypatch.setattr(Toy, "step", deadly)
+    with pytest.raises(MemoryError):
+        Recording(tmp_path).run(script, f"{TOY} {small(script)} --total-timesteps {15 * UPDATE}")
+    (path,) = tmp_path.glob("runs/*/checkpoint.pt")
+    assert runs.load(path)["iteration"] == 10
+
+
 def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     runs.write(tmp_path / "policy.pt", {"good": 1})
     with pytest.raises(pickle.UnpicklingError):  # now, and not when the run is resumed
@@ -357,6 +374,8 @@ def test_wrong_arguments_are_refused_in_a_line_or_a_box(tmp_path, script):
     ]:
         said = refusal(tmp_path, script, f"{SMALL} --total-timesteps 32", line)
         assert all(word in said for word in words), said
+    said = refusal(tmp_path, "recurrent_ppo_crane", f"{TOY} --num-minibatches 3")
+    assert "must divide" in said
     assert not (tmp_path / "runs").exists()
 
 
@@ -378,10 +397,11 @@ def test_help_shows_the_options_of_the_task(tmp_path, script):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("task", ["NanReward-v0", "InfObs-v0", "InfStart-v0"])
+@pytest.mark.parametrize("task", ["NanReward-v0", "InfObs-v0", "InfStart-v0", "InfEnd-v0"])
 def test_what_is_not_finite_is_named(tmp_path, task):
     line = f"{SMALL} --env-id toy_tasks:{task} --minibatch-size 16 --total-timesteps {UPDATE}"
     run, name = Recording(tmp_path), "reward" if "Reward" in task else "observation"
+    name = "last observation" if "End" in task else name
     with pytest.raises(SystemExit, match=f"the {name} of environment 0 is not finite: .*(nan|inf)"):
         run.run("ppo_crane", line)
     assert len(run.steps) == (0 if "Start" in task else 2)  # at once

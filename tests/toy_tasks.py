@@ -106,5 +106,6 @@ gymnasium.register("Unbounded-v0", Odd, max_episode_steps=5, kwargs={"bound": np
 gymnasium.register("NanReward-v0", Odd, 5, kwargs={"at": 3, "reward": np.nan})
 gymnasium.register("InfStart-v0", Odd, max_episode_steps=5, kwargs={"at": 0, "obs": np.inf})
 gymnasium.register("InfObs-v0", Odd, max_episode_steps=5, kwargs={"at": 3, "obs": np.inf})
+gymnasium.register("InfEnd-v0", Odd, max_episode_steps=3, kwargs={"at": 3, "obs": np.inf})
 gymnasium.register("Quick-v0", vector_entry_point=Quick)
 gymnasium.register("BonusCrane-v0", bonus_crane)
