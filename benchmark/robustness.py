@@ -94,7 +94,7 @@ def policy_of(method: str, level: str) -> Any:
 
 
 def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then: str = "") -> None:
-    """Success and metrics of a policy, in trials of seed 60000. A row that is there stays.
+    """Success and metrics of a policy, in trials of seed 60000. A row of this revision stays.
 
     then: the same task, and what follows the trial. `held` is success in both.
     """
@@ -102,7 +102,8 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
     key |= {"trial_seed": REPORT_SEED, "trials": 6 * trials}
     key = {name: str(value) for name, value in key.items()}
     options = protocol.task_options(env_id)
-    if any(key.items() <= row.items() for row in read_rows(path)):
+    row = key | {"revision": str(protocol.crane_class(env_id).REVISION)}
+    if any(row.items() <= known.items() for known in read_rows(path)):
         return
     if hasattr(options, "sensors"):
         options = replace(options, sensors=sensors)
@@ -114,8 +115,9 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
         later = eval_crane.play(policy, then, options, args)
         line["held"] = 100 * np.mean([a["success"] and b["success"] for a, b in zip(rows, later)])
     for name in ("success", *(["held"] if then else []), "gentle", *METRICS):
-        key[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
-    write_rows(path, [*read_rows(path), key | {"failures": line["failures"]}])
+        row[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
+    others = [known for known in read_rows(path) if not key.items() <= known.items()]
+    write_rows(path, [*others, row | {"failures": line["failures"]}])
 
 
 def levels(trials: int = 100, folder: Path = RESULTS) -> None:
