@@ -129,7 +129,7 @@ class Run(NamedTuple):
     @property
     def alone(self) -> bool:
         """Whether it has two cores for itself, as README's command has: its minutes count."""
-        both = self.folder == "curves" or (self.folder in ("levels", "loading") and self.seed == 21)
+        both = self.folder == "curves" or (self.folder == "levels" and self.seed == 21)
         return both and self.script == MPPO
 
 
