@@ -363,7 +363,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         if self.options.contact == "primitive" and spec.option.timestep < physics_step <= self.dt:
             self.frame_skip = int(np.ceil(self.dt / physics_step - 1e-9))
             spec.option.timestep = self.dt / self.frame_skip
-        self.coarse = self.options.frame_skip / self.frame_skip  # 1, or longer by this factor
+        self.coarse = self.options.frame_skip / self.frame_skip  # how many times as long
         self.piece = int(np.ceil(self.PIECE / spec.option.timestep - 1e-9))  # physics steps
         spec.sensor("ground_force").nsample = self.piece
         self.model = model = spec.compile()
@@ -405,7 +405,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def history(self, name: str) -> Array:
-        """Live values of a sensor at its last `nsample` physics steps, in no order, (N, any)."""
+        """A sensor's values at its last `nsample` physics steps, live, unordered, (N, all)."""
         i = self.model.sensor(name).id
         n = self.model.sensor_history[i, 0]
         start = self.model.sensor_historyadr[i] + 2 + n  # behind the times of the samples
@@ -486,7 +486,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return values
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
-        """New episodes of all cranes, from one seed (crane i draws from its i-th child) or N."""
+        """New episodes of all cranes, from N seeds or one (crane i draws from its i-th child)."""
         if seed is not None or self.rngs is None:
             if np.ndim(seed) == 0:  # one, or None
                 seed = SeedSequence(seed).spawn(self.num_envs)

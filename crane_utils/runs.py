@@ -131,7 +131,7 @@ def write(path: Path, contents: dict[str, Any]) -> None:
     """Write a file whole or not at all: a kill or a full disk leaves the old one."""
     unfinished = path.with_suffix(".unfinished")
     torch.save(contents, unfinished)
-    load(unfinished)  # it refuses what torch.save takes, as paths or NumPy's numbers
+    load(unfinished)  # it refuses what torch.save takes, such as paths or NumPy's numbers
     os.replace(unfinished, path)
 
 
