@@ -48,7 +48,7 @@ class Args:
     # run
     exp_name: str = Path(__file__).stem  # part of the run's folder name
     seed: Annotated[int, Field(ge=0)] = 1  # of the networks, the policy's samples and the episodes
-    total_timesteps: Count = 1_024_000  # steps of all cranes together, in whole rollouts
+    total_timesteps: Count = 2_048_000  # steps of all cranes together, in whole rollouts
     device: Literal["cpu", "cuda"] = "cpu"  # where the networks live
     threads: Count = 2  # CPU threads of physics and updates
     eval_every: Count = 25  # updates between evaluations
