@@ -161,7 +161,8 @@ def costs() -> str:
         if row["trained_on"] == row["evaluated_on"]:
             cells = [f"{float(row[name]):.3g}" if row[name] else "" for name in metrics]
             lines.append([row["trained_on"], row["method"], *cells])
-    lines.sort(key=lambda line: [*LEVELS].index(line[0]))
+    methods = [*LABELS.values(), "scripted"]
+    lines.sort(key=lambda line: ([*LEVELS].index(line[0]), methods.index(line[1])))
     return table(["level", "method", *metrics], lines)
 
 
