@@ -359,11 +359,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             decorate(spec)
         spec.compiler.discardvisual = render_mode is None  # the same motion, sooner
         self.dt = self.options.frame_skip * spec.option.timestep  # s, one step
-        self.frame_skip = self.options.frame_skip  # physics steps in a step
+        self.physics_steps = self.options.frame_skip  # in a step
         if self.options.contact == "primitive" and spec.option.timestep < physics_step <= self.dt:
-            self.frame_skip = int(np.ceil(self.dt / physics_step - 1e-9))
-            spec.option.timestep = self.dt / self.frame_skip
-        self.coarse = self.options.frame_skip / self.frame_skip  # how many times as long
+            self.physics_steps = int(np.ceil(self.dt / physics_step - 1e-9))
+            spec.option.timestep = self.dt / self.physics_steps
+        self.coarse = self.options.frame_skip / self.physics_steps  # how many times as long
         self.piece = int(np.ceil(self.PIECE / spec.option.timestep - 1e-9))  # physics steps
         spec.sensor("ground_force").nsample = self.piece
         self.model = model = spec.compile()
@@ -457,6 +457,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
         # reward
         terms = self.checked(self.reward_terms(state, info))
+        if taken := terms.keys() & info.keys():
+            raise ValueError(f"reward_terms must have other names than info's {taken}")
         info |= {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
         reward = sum(info[name] for name in terms)
 
@@ -486,9 +488,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return values
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
-        """New episodes of all cranes, from N seeds or one (crane i draws from its i-th child)."""
+        """New episodes of all cranes or of options["reset_mask"] (N,), from N seeds or one."""
         if seed is not None or self.rngs is None:
-            if np.ndim(seed) == 0:  # one, or None
+            if np.ndim(seed) == 0:  # one, or None: crane i draws from its i-th child
                 seed = SeedSequence(seed).spawn(self.num_envs)
             seeds = [s if isinstance(s, SeedSequence) else SeedSequence(s) for s in seed]
             if len(seeds) != self.num_envs:
@@ -499,7 +501,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
             self.recent_success = [deque(maxlen=10) for _ in seeds]  # a crane's last episodes
-        self.start_episodes(np.arange(self.num_envs))
+        self.start_episodes(np.flatnonzero((options or {}).get("reset_mask", self.steps >= 0)))
         info = self.measure(state := self.state())
         masks = {f"_{key}": np.ones(self.num_envs, bool) for key in info}
         return self.bounded_observation(state), info | masks
@@ -580,13 +582,13 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     # ---- hooks: what moves the joints
 
     def simulate(self) -> Array:
-        """frame_skip physics steps under `command`; which cranes diverged, (N,)."""
+        """The physics steps of one step under `command`; which cranes diverged, (N,)."""
         failed = np.zeros(self.num_envs, bool)
         self.impact[:] = 0.0
         # A piece may span several short steps: only the first of them drives and clamps.
-        steps_per_piece = max(1, self.piece // self.frame_skip)
+        steps_per_piece = max(1, self.piece // self.physics_steps)
         due = self.steps % steps_per_piece == 0
-        for left in range(self.frame_skip, 0, -self.piece):  # physics steps
+        for left in range(self.physics_steps, 0, -self.piece):  # physics steps
             nstep = min(self.piece, left)
             self.drive(np.flatnonzero(due), nstep * steps_per_piece * self.model.opt.timestep)
             # Anti-windup: an integrator leads its joint by no more than the force limit can use.

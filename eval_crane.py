@@ -8,9 +8,10 @@
     python eval_crane.py --video lift.mp4               # film one trial per diameter
     python eval_crane.py --viewer                       # watch, or drive, in a window
 
-A trial succeeds if the log is reached within 6 s, and is lifted, held by both jaws and gripped
-within 0.3 m of its centre throughout the last 0.5 s of 9 s. Trial k of a diameter and a seed is
-always the same trial. A run's folder holds the script that trained it, and that code runs here.
+A trial of lifting succeeds if the log is reached within 6 s, and is lifted, held by both jaws and
+gripped within 0.3 m of its centre throughout the last 0.5 s of 9 s. Trial k of a diameter and a
+seed is always the same trial. A run's folder holds the script that trained it, and that code runs
+here.
 """
 
 import csv
@@ -116,8 +117,9 @@ BUILT_IN = {
 
 LEGEND = """\
 Gentle: success, and `ground_peak` at most 20 kN. Peak: its median in all trials. The other
-columns are of the successes: means of reach (until the log is reached) and miss (from grip to log
-centre), medians of the others. Up: when all conditions of success had held for 0.5 s."""
+columns are of the successes: means of reach (until the log is reached) and miss (from grapple to
+log centre at the end), medians of the others. Up: when all conditions of success had held for
+0.5 s."""
 PAPERS = " The paper's rule is weaker. Its training took 500 million physics steps."
 
 

@@ -87,9 +87,8 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
     SCRIPTED = "crane_utils.scripted_loading:ScriptedLoadingCrane"  # of eval_crane.py
 
     def __init__(self, num_envs: int = 1, **kwargs: Any):
-        self.bed_speed = np.zeros(num_envs)  # m/s
+        self.bed_speed, self.loose = np.zeros((2, num_envs))  # m/s; steps off the log
         self.lifted, self.starts_held = np.zeros((2, num_envs), bool)
-        self.loose = np.zeros(num_envs, int)  # steps since the crane touched the log
         super().__init__(num_envs, **kwargs)
         self.on_bed = self.history("log_on_bed")  # both live
         self.on_log = self.sensordata[:, self.model.sensor("crane_on_log").adr[0]]
@@ -146,7 +145,9 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
 
     def simulate(self) -> Array:
         """The physics steps, and how fast the log met the bed in them, where they touched."""
+        self.on_bed[:] = 0.0  # its history may be longer than this step
         diverged = super().simulate()
+        self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
         hits = np.linalg.norm(self.on_bed.reshape(self.num_envs, -1, 4)[..., 1:], axis=-1)
         self.bed_speed = fastest = np.maximum(self.bed_speed, hits.max(axis=-1))
         self.ground_peak = np.maximum(self.ground_peak, fastest * GENTLE_FORCE / GENTLE_SPEED)
@@ -184,7 +185,6 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         """not_lifted: after LIFT_TIME. log_lost: loose beside the bunk, low or for HOLD_TIME."""
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
-        self.loose = np.where(self.on_log > 0, 0, self.loose + 1)
         dropped = ((self.loose > 0) & (lowest < SETTLED)) | (self.loose >= self.hold_steps)
         lost = self.lifted & dropped & (outside | (lowest < BED - HIT))
         ends = {"not_lifted": (info["time"] > LIFT_TIME) & ~self.lifted, "log_lost": lost}

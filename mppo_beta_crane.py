@@ -68,7 +68,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; up to 0.005, or above a step: the task's own
+    physics_step: Factor = 0.01  # cranes: s in training; up to 0.005, or above a step: the task's
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -88,8 +88,8 @@ class Args:
     log_excess_init: float = 1.5  # log(alpha - 1), log(beta - 1) at the start, before the bound
 
     # schedules (docs/training.md)
-    curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
-    retry: Share = 0.5  # largest share of episodes that repeat a failed start
+    curriculum: Share = 0.4  # cranes: share of the run in which the difficulty rises to 1
+    retry: Share = 0.5  # cranes: largest share of episodes that repeat a failed start
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
     narrowing: float = 2.5  # rise of the actor's outputs in the run, before the bound
 
@@ -297,7 +297,7 @@ if __name__ == "__main__":
 
         # Evaluate
         final = iteration == num_iterations
-        if final or (iteration % args.eval_every == 0 and not stop.received):
+        if final or iteration % args.eval_every == 0:
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():

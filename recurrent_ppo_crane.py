@@ -59,7 +59,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; up to 0.005, or above a step: the task's own
+    physics_step: Factor = 0.01  # cranes: s in training; up to 0.005, or above a step: the task's
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -79,8 +79,8 @@ class Args:
     log_std_init: float = -1.2  # log sigma at the start; actions reach from -1 to 1
 
     # schedules (docs/training.md)
-    curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
-    retry: Share = 0.5  # largest share of episodes that repeat a failed start
+    curriculum: Share = 0.4  # cranes: share of the run in which the difficulty rises to 1
+    retry: Share = 0.5  # cranes: largest share of episodes that repeat a failed start
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
     narrowing: float = 1.25  # fall of log sigma in the run
 
@@ -322,7 +322,7 @@ if __name__ == "__main__":
 
         # Evaluate
         final = iteration == num_iterations
-        if final or (iteration % args.eval_every == 0 and not stop.received):
+        if final or iteration % args.eval_every == 0:
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():

@@ -63,7 +63,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 128  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # s, in training; up to 0.005, or above a step: the task's own
+    physics_step: Factor = 0.01  # cranes: s in training; up to 0.005, or above a step: the task's
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -84,8 +84,8 @@ class Args:
     log_std_init: float = -1.2  # log sigma at the start; actions reach from -1 to 1
 
     # schedules (docs/training.md)
-    curriculum: Share = 0.4  # share of the run in which the difficulty rises to that of the task
-    retry: Share = 0.0  # largest share of episodes that repeat a failed start
+    curriculum: Share = 0.4  # cranes: share of the run in which the difficulty rises to 1
+    retry: Share = 0.0  # cranes: largest share of episodes that repeat a failed start
     horizon_growth: Annotated[float, Field(ge=1)] = 3.0  # 1 / (1 - gamma) grows by this factor
     narrowing: float = 0.3  # fall of log sigma in the run
 
@@ -262,8 +262,9 @@ if __name__ == "__main__":
     torch.manual_seed(args.seed)
     torch.set_num_threads(args.threads)  # the rounding of the weights depends on it
     agent = Agent(obs_space.shape[0], action_space.low, action_space.high, args).to(device)
-    weights = agent.critic.parameters()
-    optimizer = torch.optim.Adam(weights, lr=args.learning_rate, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(
+        agent.critic.parameters(), lr=args.learning_rate, eps=1e-5, fused=True
+    )
     first_iteration, env_seed = runs.restore(args, checkpoint, agent, optimizer)
 
     folder, stop = runs.make_folder(args), runs.StopSignal()
@@ -362,7 +363,7 @@ if __name__ == "__main__":
 
         # Evaluate
         final = iteration == num_iterations
-        if final or (iteration % args.eval_every == 0 and not stop.received):
+        if final or iteration % args.eval_every == 0:
             number = args.final_trials if final else args.eval_trials
             scores = trials.evaluate(agent, args.env_id, number, **evaluation)
             for name, score in scores.items():

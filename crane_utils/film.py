@@ -44,8 +44,8 @@ def caption(crane: CraneVectorEnv, driver: str, metrics: Metrics, failure: str |
     elif log_clearance(state)[0] < 0.01:
         phase = "gripping" if np.isfinite(crane.reach_time[0]) else "reaching"
     else:  # the log is off the ground
-        conditions_hold = all(streak[0] > 0 for streak in crane.streaks.values())
-        phase = "safe" if conditions_hold else "lifting"
+        safe = all(streak[0] >= crane.hold_steps for streak in crane.streaks.values())
+        phase = "safe" if safe else "lifting"
     mass = crane.log_mass[0]
     return {
         "log": f"{state.diameter[0]:.2f} m, {mass:.0f} kg",

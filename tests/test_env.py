@@ -97,6 +97,17 @@ def test_a_crane_is_the_same_for_any_number_of_cranes_and_threads():
     assert np.abs(reference - crane(5, 1, 3)).max() > 0.1
 
 
+def test_some_cranes_can_be_reset():
+    envs = CraneVectorEnv(3, autoreset=False)
+    envs.reset(seed=0)
+    for _ in range(5):
+        before, *_ = envs.step(np.ones((3, 6)))
+    mask = np.array([True, False, False])
+    after, _ = envs.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(envs.steps, [0, 5, 5])
+    np.testing.assert_array_equal((after != before).any(axis=1), mask)
+
+
 def test_seeds():
     """A seed starts anew, no seed goes on, and none at all is another one each time."""
     envs = cranes(2)
@@ -432,7 +443,7 @@ def test_coarser_physics_is_the_same_task(skip, physics_step, steps):
     assert (fine.dt, fine.max_steps, fine.hold_steps) == (
         coarse.dt, coarse.max_steps, coarse.hold_steps
     )  # fmt: skip
-    assert (fine.frame_skip, coarse.frame_skip) == (skip, steps)
+    assert (fine.physics_steps, coarse.physics_steps) == (skip, steps)
     assert coarse.model.opt.timestep == pytest.approx(fine.dt / steps)
     for envs in kinds:
         envs.reset(seed=5)
@@ -472,7 +483,7 @@ def test_coarser_physics_does_not_chatter():
 
 def test_sdf_contacts_keep_their_physics_step():
     envs = CraneVectorEnv(1, contact="sdf", physics_step=0.01)
-    assert envs.frame_skip == 20 and envs.model.opt.timestep == 0.005
+    assert envs.physics_steps == 20 and envs.model.opt.timestep == 0.005
 
 
 WRONG = [
@@ -496,6 +507,7 @@ def test_wrong_arguments(options, words):
     [
         ("observe", np.zeros((2, 1)), "observe gives (2, 1), observation_limits (2, 18)"),
         ("reward_terms", {"r_wind": 0.5}, "r_wind must be (2,), not ()"),
+        ("reward_terms", {"clearance": np.zeros(2)}, "other names than info's {'clearance'}"),
         ("rules", {"fell": np.array([True])}, "fell must be (2,), not (1,)"),
         ("conditions", {"late": True}, "late must be (2,), not ()"),
     ],

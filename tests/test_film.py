@@ -66,7 +66,7 @@ def test_the_caption_names_the_phase():
     envs, phases = Short(1, diameter=0.4), []
     envs.reset(seed=0)
     metrics = film.Metrics(envs)
-    for reached, height, streak in [(np.inf, 0.2, 0), (1.0, 0.2, 0), (1.0, 2.0, 0), (1.0, 2.0, 1)]:
+    for reached, height, streak in [(np.inf, 0.2, 0), (1.0, 0.2, 0), (1.0, 2.0, 1), (1.0, 2.0, 6)]:
         envs.reach_time[:], envs.qpos[0, 12] = reached, height
         envs.streaks = {"too_thick": np.array([streak])}
         envs.batch.forward()

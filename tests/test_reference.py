@@ -87,7 +87,7 @@ def replay(envs, seconds, drivers=None, difficulties=(), **task):
     rough = options["contact"] == "sdf" and options["frame_skip"] > 1
     same = partial(compare, tolerance=2e-3 if rough else 1e-5)
     # an observer looks after each physics step, and must not change what the crane does
-    metrics, seen = Metrics(envs) if envs.frame_skip > 3 else None, Counter()
+    metrics, seen = Metrics(envs) if envs.physics_steps > 3 else None, Counter()
     obs, info = envs.reset(seed=5)
     for i, crane in enumerate(cranes):
         same(obs[i], crane.start(), (i, "start"))

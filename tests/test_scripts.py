@@ -93,7 +93,7 @@ def test_a_run_on_cranes(tmp_path, monkeypatch, script):
         return scores
 
     def watched_reset(envs, **kwargs):
-        resets.append((envs.difficulty, envs.retry, envs.frame_skip, kwargs["seed"]))
+        resets.append((envs.difficulty, envs.retry, envs.physics_steps, kwargs["seed"]))
         return reset(envs, **kwargs)
 
     monkeypatch.setattr(trials, "evaluate", watched)
@@ -193,14 +193,15 @@ def test_a_signal_stops_after_the_update_and_resume_goes_on(tmp_path, monkeypatc
     monkeypatch.setattr(Toy, "step", signalled)
     line = f"{TOY} {small(script)} --update-epochs 2 --target-kl 0.5 --reward-scale 0.123"
     with pytest.raises(SystemExit, match=r"stopped after update 3; go on with --resume runs/\S+$"):
-        run.run(script, f"{line} --total-timesteps {6 * UPDATE}")
+        run.run(script, f"{line} --total-timesteps {6 * UPDATE} --eval-every 3")
     (folder,) = (tmp_path / "runs").iterdir()
     assert torch.load(folder / "checkpoint.pt", weights_only=True)["iteration"] == 3
-    assert len(run.steps) == 3 * 8 and not run.scalars["eval/episodic_return"]
+    assert len(run.steps) == 3 * 8
+    assert run.scalars["eval/episodic_return"].keys() == {3 * UPDATE}  # was due
 
     done = len(run.permutations)
-    left = run.run(script, f"--resume {folder} --total-timesteps {8 * UPDATE}")
-    assert run.scalars["eval/episodic_return"].keys() == {8 * UPDATE}
+    left = run.run(script, f"--resume {folder} --total-timesteps {8 * UPDATE} --eval-every 9")
+    assert run.scalars["eval/episodic_return"].keys() == {3 * UPDATE, 8 * UPDATE}
     assert [*(tmp_path / "runs").iterdir()] == [folder] and len(run.updates) == 8
     assert run.purge_steps == [1, 3 * UPDATE + 1]
     assert {*run.scalars["losses/value_loss"]} == {k * UPDATE for k in range(1, 9)}
