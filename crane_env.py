@@ -501,10 +501,10 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.rngs = [tuple(map(default_rng, stream)) for stream in streams]
             self.failures = [deque(maxlen=4) for _ in seeds]  # starts of failed episodes
             self.recent_success = [deque(maxlen=10) for _ in seeds]  # a crane's last episodes
-        self.start_episodes(np.flatnonzero((options or {}).get("reset_mask", self.steps >= 0)))
+        everyone = np.ones(self.num_envs, bool)
+        self.start_episodes(np.flatnonzero((options or {}).get("reset_mask", everyone)))
         info = self.measure(state := self.state())
-        masks = {f"_{key}": np.ones(self.num_envs, bool) for key in info}
-        return self.bounded_observation(state), info | masks
+        return self.bounded_observation(state), info | {f"_{key}": everyone for key in info}
 
     # ---- hooks: the model, the start of an episode
 
