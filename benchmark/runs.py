@@ -68,9 +68,12 @@ HARD["hydraulic"][MPPO] += "--learning-rate 1e-3"
 HARD["randomized"][MPPO] = f"--env-id {LEVELS['randomized']} --total-timesteps 7372800 "
 HARD["randomized"][MPPO] += "--num-envs 256 --curriculum 0.2 --learning-rate 7e-4 "
 HARD["randomized"][MPPO] += "--minibatch-size 2048"
-CYCLE = "--total-timesteps 8192000 --num-envs 128 --minibatch-size 2048 --learning-rate 1e-3 "
-CYCLE += "--curriculum 0.3 --horizon-growth 1.5 --reward-scale 0.02 --ent-coef 0.003 "
-CYCLE += "--eval-every 100 --env-id "
+CYCLE = "--total-timesteps 8192000 --num-envs 128 --curriculum 0.3 --horizon-growth 1.5 "
+CYCLE += "--reward-scale 0.02 --ent-coef 0.003 --eval-every 100 "
+CYCLES = {  # mPPO loads on both levels
+    MPPO: CYCLE + "--minibatch-size 2048 --learning-rate 1e-3 --env-id ",
+    RECURRENT: CYCLE + "--learning-rate 7e-4 --env-id " + LOADING["hydraulic"],
+}
 PRINTED = "--total-timesteps 25000000 --eval-every 200 --env.reward paper --env.offset minus "
 PRINTED += "--env.signed-yaw False --env.axes world"  # 500 million physics steps, as in the paper
 ABLATIONS = {  # what it is in the figure, script and flags
@@ -101,8 +104,9 @@ TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
     *[("levels", f"{script}_{level}", script, flags, FIVE if level == "hydraulic" else THREE)
       for level in HARD for script, flags in HARD[level].items()],
-    *[("loading", f"{MPPO}_{level}", MPPO, CYCLE + env_id, THREE)
+    *[("loading", f"{MPPO}_{level}", MPPO, CYCLES[MPPO] + env_id, THREE)
       for level, env_id in LOADING.items()],
+    ("loading", f"{RECURRENT}_hydraulic", RECURRENT, CYCLES[RECURRENT], (21,)),
     ("printed", MPPO, MPPO, PRINTED, (21,)),
     ("short", MPPO, MPPO, HALF, THREE),
     *[("ablations", name, script, SHORT + flags, THREE)
