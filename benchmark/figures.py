@@ -22,6 +22,7 @@ from tyro.conf import Positional
 import eval_crane
 from benchmark import runs, tables
 from benchmark.runs import LABELS, LEVELS, RESULTS, ROOT, Curve, read_curves, read_rows
+from crane_env import mujoco  # it has chosen how to draw without a display
 from crane_utils import trials
 from crane_utils.world import decorate
 from hydraulic_crane import HydraulicCraneVectorEnv
@@ -182,8 +183,6 @@ def robustness() -> None:
 
 def response(axis: str, action: float, at_work: bool = False, step: float = 0.005) -> Array:
     """Speed / command after each step of 1.25 s, with the record's inertia or the crane's own."""
-    import mujoco  # after crane_env, which chooses its OpenGL
-
     _, inertia, pose = AXES[axis]
     q2, q3, q4, q8 = (0.5, 0.2, 0.5, 0.3) if at_work else pose
     q = np.array([[-1.2, q2, q3, q4, np.pi / 2 - q2 - q3, np.pi / 2, 0, q8]])
@@ -284,6 +283,8 @@ def failures(policy: Positional[str] = f"{POLICIES}/trpo_crane.pt") -> None:
     args = eval_crane.Args(seed=trials.REPORT_SEED)
     rows = [*eval_crane.play(agent, task["env_id"], options, args)]
     rows = [row for row in rows if not row["success"]]
+    if not rows:
+        raise SystemExit(f"{policy} fails in none of its trials")
     taken = []
     for k in np.unique(np.linspace(0, len(rows) - 1, 8).astype(int)):
         diameter, trial = rows[k]["diameter"], rows[k]["trial"]

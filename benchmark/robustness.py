@@ -7,8 +7,9 @@
     python benchmark/robustness.py contacts   # results/contacts.csv: the paper's SDF contacts
     python benchmark/robustness.py changes --trials 1 --folder /tmp/test    # does it work?
 
-The policies are the shipped ones and the scripted crane. Rows that a file has are not measured
-again: if a policy has changed, delete the file. `figures.py robustness` draws the changes.
+The policies are the shipped ones and the scripted crane. Rows of the task's present revision are
+not measured again: if a policy has changed, delete the file. `figures.py robustness` draws the
+changes.
 """
 
 import sys
@@ -116,7 +117,8 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
         line["held"] = 100 * np.mean([a["success"] and b["success"] for a, b in zip(rows, later)])
     for name in ("success", *(["held"] if then else []), "gentle", *METRICS):
         row[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
-    others = [known for known in read_rows(path) if not key.items() <= known.items()]
+    of_policy = {name: key[name] for name in key if name not in ("per_diameter", "trials")}
+    others = [known for known in read_rows(path) if not of_policy.items() <= known.items()]
     write_rows(path, [*others, row | {"failures": line["failures"]}])
 
 

@@ -5,8 +5,9 @@
 
 The run curves/ppo_crane_seed21 gets a row an update in benchmark/results/curves/. If its file is
 there, it is not made again. Two trainings run side by side with one thread each, those whose
-minutes count alone with two. Ctrl-C stops them after their update, and the next call resumes them
-from benchmark/runs/. After a change of the task delete that folder.
+minutes count alone with two. Ctrl-C (not `kill`) stops them after their update, and the next call
+resumes them from benchmark/runs/ with their old flags. After a change of the task or of a run's
+flags delete its folder there.
 
 Final policies of curves/, levels/, loading/ and short/ get 600 trials of seed 60000 with exact pose
 and 600 with pose errors: benchmark/results/evaluations.csv, without runs whose own file is gone.
@@ -236,7 +237,10 @@ def make(run: Run) -> str:
     if run.folder in ("curves", "levels", "loading", "short"):
         for noise in ("none", "step"):
             key = {"run": label, "seed": run.seed, "pose_noise": noise, "trial_seed": REPORT_SEED}
-            evaluated.append(key | evaluate(str(folder), noise))
+            try:
+                evaluated.append(key | evaluate(str(folder), noise))
+            except SystemExit as error:  # the other runs go on
+                return f"stopped: {run}, {error}"
     with WRITING:
         if evaluated:
             for row in read_rows(RESULTS / "evaluations.csv"):

@@ -167,7 +167,7 @@ def brief(numbers: dict[str, float]) -> str:
 
 def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> None:
     """SystemExit that names what is not finite after an update."""
-    wrong = [name for name, value in stats.items() if value != value or abs(value) == float("inf")]
+    wrong = [name for name, value in stats.items() if not np.isfinite(value)]
     wrong += [name for name, weights in agent.named_parameters() if not weights.isfinite().all()]
     if wrong:
         what = f"update {iteration}: {', '.join(wrong[:3])} not finite"

@@ -3,9 +3,10 @@
 `CraneVectorEnv(decorate=decorate)` adds it to the model. Nothing here collides or moves.
 """
 
-import mujoco
 import numpy as np
 from numpy import ndarray as Array
+
+from crane_env import mujoco  # it has chosen how to draw without a display
 
 TREES = 150
 NEAREST_TREE, FARTHEST_TREE = 19.0, 48.0  # m from the crane; the overview camera is 14 m away

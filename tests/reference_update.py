@@ -23,7 +23,7 @@ class Reference:
     """Its weights `w` and what it remembers between updates: moments, statistics, memories.
 
     args: the script's arguments by name. of_ranks: the observation normalizer changes after each
-    rollout, and advantages have the standard deviation of a population.
+    rollout.
     """
 
     def __init__(self, args: dict, weights: dict, of_ranks: bool = False):

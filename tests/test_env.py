@@ -304,11 +304,10 @@ def test_rules():
         situation("none", state.dq, joint, 1.99 * FASTEST[joint])
     situation("none", state.grapple_centre, 2, 8.1)
     situation("log_too_far", state.grapple_centre, 2, 8.3)
-    for time, reached in ((5.9, np.inf), (6.0, 6.0), (6.0, np.inf)):
+    never = np.inf
+    for time, reached, ending in [(5.9, never, "none"), (6, 6, "none"), (6, never, "not_reached")]:
         info["time"][len(expected)] = time
-        situation(
-            "not_reached" if time < reached and time == 6 else "none", envs.reach_time, 0, reached
-        )
+        situation(ending, envs.reach_time, 0, reached)
     state.q[len(expected), 0] = 9.0  # the first rule counts
     situation("diverged", info["diverged"], 0, True)
     rules = envs.rules(state, info)

@@ -43,9 +43,10 @@ class Waving:
         return np.cos(step + np.arange(6))[None], step + 1
 
 
-def test_a_film_shows_the_trials_that_are_evaluated(opengl, tmp_path):
+@pytest.mark.parametrize("file", ["film.gif", "film.mp4"])
+def test_a_film_shows_the_trials_that_are_evaluated(opengl, tmp_path, file):
     """To the last bit, with another trial's number; and a film that fails leaves the old one."""
-    filmed, evaluated, path = Waving(), Waving(), tmp_path / "film.gif"
+    filmed, evaluated, path = Waving(), Waving(), tmp_path / file
     what = ("mine", "Short-v0", OPTIONS, path, [0.3, 0.8], 10_000, 2)
     assert film.film(filmed, *what, width=128) == [True, False]
     for diameter in (0.3, 0.8):

@@ -20,7 +20,7 @@ AREAS = np.array([  # m^3/rad, m^3/m, or m^2 of a cylinder, at -1 and +1
 
 
 def standing(q2, q3, q4, q8, n=1, cranes=HydraulicCraneVectorEnv, **options):
-    """Plumb cranes with logs out of the way; and their joints."""
+    """Plumb cranes with logs out of the way."""
     q = np.array([-1.2, q2, q3, q4, np.pi / 2 - q2 - q3, np.pi / 2, 0.0, q8])
     return place(np.tile(q, (n, 1)), 0.3, cranes=cranes, **options)
 

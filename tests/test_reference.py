@@ -105,10 +105,8 @@ def replay(envs, seconds, drivers=None, difficulties=(), **task):
             crane.difficulty = envs.difficulty
             expected, total, said = crane.step(actions[i])
             ending = said["termination"]
-            ended = ending != "none"
-            assert truncated[i] == (ending == "time_limit") and terminated[i] != (
-                truncated[i] or not ended
-            )
+            ended, cut = ending != "none", ending == "time_limit"
+            assert (terminated[i], truncated[i]) == (ended and not cut, cut)
             same(info["final_obs"][i] if ended else obs[i], expected, here + "observation")
             for name, value in said.items():  # a term of the reward: mend reference_crane.py, too
                 same(info[name][i], value, here + name)

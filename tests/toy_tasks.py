@@ -81,7 +81,7 @@ class Quick(CraneVectorEnv):
 
     TIME_LIMIT, HOLD_TIME, REVISION = 0.5, 0.1, 3
 
-    def rules(self, state, diverged):
+    def rules(self, state, info):
         return {"thinnest": (state.diameter < 0.35) & (self.steps == 2)}
 
     def measure(self, state):
@@ -103,7 +103,7 @@ gymnasium.register("Echo-v0", Recall, kwargs={"length": 1})
 gymnasium.register("Endless-v0", Odd, max_episode_steps=5)
 gymnasium.register("NoEnd-v0", Odd)
 gymnasium.register("Unbounded-v0", Odd, max_episode_steps=5, kwargs={"bound": np.inf})
-gymnasium.register("NanReward-v0", Odd, 5, kwargs={"at": 3, "reward": np.nan})
+gymnasium.register("NanReward-v0", Odd, max_episode_steps=5, kwargs={"at": 3, "reward": np.nan})
 gymnasium.register("InfStart-v0", Odd, max_episode_steps=5, kwargs={"at": 0, "obs": np.inf})
 gymnasium.register("InfObs-v0", Odd, max_episode_steps=5, kwargs={"at": 3, "obs": np.inf})
 gymnasium.register("InfEnd-v0", Odd, max_episode_steps=3, kwargs={"at": 3, "obs": np.inf})
