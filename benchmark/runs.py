@@ -100,7 +100,6 @@ ABLATIONS = {  # what it is in the figure, script and flags
 }  # fmt: skip
 SHORT = "--total-timesteps 614400 --eval-every 10 "
 HALF = "--total-timesteps 512000 --update-epochs 8 --learning-rate 1e-3 --eval-every 8"
-FIRST = "--total-timesteps 300000 --num-steps 32 --minibatch-size 512"  # docs/tutorial.md
 FIVE, THREE = range(21, 26), range(21, 24)
 TRAININGS = [  # folder, name, script, flags, seeds
     *[("curves", script, script, "", FIVE) for script in LABELS],
@@ -111,7 +110,6 @@ TRAININGS = [  # folder, name, script, flags, seeds
     ("loading", f"{RECURRENT}_hydraulic", RECURRENT, CYCLES[RECURRENT], (21,)),
     ("printed", MPPO, MPPO, PRINTED, (21,)),
     ("short", MPPO, MPPO, HALF, THREE),
-    ("tutorial", MPPO, MPPO, FIRST, FIVE),
     *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],
 ]  # fmt: skip
