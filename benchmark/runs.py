@@ -109,7 +109,7 @@ TRAININGS = [  # folder, name, script, flags, seeds
       for level, env_id in LOADING.items()],
     ("loading", f"{RECURRENT}_hydraulic", RECURRENT, CYCLES[RECURRENT], (21,)),
     ("printed", MPPO, MPPO, PRINTED, (21,)),
-    ("short", MPPO, MPPO, HALF, THREE),
+    ("short", MPPO, MPPO, HALF, FIVE),
     *[("ablations", name, script, SHORT + flags, THREE)
       for name, (_, script, flags) in ABLATIONS.items()],
 ]  # fmt: skip
