@@ -87,6 +87,13 @@ def each_seed(folder: str, levels: Iterable[str]) -> Iterator[tuple[list[str], l
             yield [level, method, ", ".join(steps), ", ".join(row["seed"] for row in rows)], rows
 
 
+def short() -> str:
+    """short/: success at the end of half of the steps, as a user's terminal shows it."""
+    found = read_curves("short")[runs.MPPO]
+    ends = [f"{100 * run['eval_success_rate'][-1]:.1f}" for run in found.values()]
+    return table(["training seed", *map(str, found)], [["success", *ends]])
+
+
 def causes(rows: list[dict[str, str]]) -> str:
     """What failed trials are counted under, sums of the seeds, the most frequent first."""
     counts: Counter[str] = Counter()
@@ -282,7 +289,7 @@ def held() -> str:
 
 
 ALL = (results, seeds, loading, learning, paper, costs, held, timed, ablations, robustness, speed)
-ALL += (leaderboard, rivals)
+ALL += (leaderboard, rivals, short)
 TABLES: dict[str, Callable[[], str]] = {make.__name__: make for make in ALL}
 
 
