@@ -117,6 +117,7 @@ def add_row(path: Path, key: dict, policy: Any, env_id: str, sensors: bool, then
         line["held"] = 100 * np.mean([a["success"] and b["success"] for a, b in zip(rows, later)])
     for name in ("success", *(["held"] if then else []), "gentle", *METRICS):
         row[name] = line[name] if line[name] == "" else f"{line[name]:.4g}"
+    # one row of a policy on a crane, however many trials it has
     of_policy = {name: key[name] for name in key if name not in ("per_diameter", "trials")}
     others = [known for known in read_rows(path) if not of_policy.items() <= known.items()]
     write_rows(path, [*others, row | {"failures": line["failures"]}])
