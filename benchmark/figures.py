@@ -116,6 +116,7 @@ def curves() -> None:
         script, level = name.rsplit("_", 1)
         lines[f"{LABELS[script]}, {level}"] = [*of_seed.values()]
     columns = {"steps [million], loading cycle": (lines, "steps", 1e-6)}
+    rows = {"success": "eval_success_rate", "return": "eval_episodic_return"}
     panels(columns, rows, FIGURES / "loading_curves.svg")
 
 
@@ -293,8 +294,12 @@ def failures(policy: Positional[str] = f"{POLICIES}/trpo_crane.pt") -> None:
     sheet(taken, 4, FIGURES / "failures.jpg")
 
 
-def hero(policy: Positional[str], diameter: float = 0.6, trial: int = 0) -> None:
-    """Make loading.gif, the loading cycle at double speed. policy: a run's folder or policy.pt."""
+def hero(
+    policy: Positional[str] = f"{POLICIES}/mppo_beta_crane_hydraulic_loading.pt",
+    diameter: float = 0.6,
+    trial: int = 0,
+) -> None:
+    """Make loading.gif, the loading cycle at double speed."""
     taken = pictures(policy, diameter, trial, 2, size=(800, 450))
     # One palette and no dithering: where nothing moves no pixel changes, and GIF stores nothing.
     palette = taken[len(taken) // 2].quantize(128)
