@@ -62,7 +62,7 @@ class Args:
     """run's folders or policy.pt files; scripted, zero or random; my_module:MyPolicy; none: the
     shipped mPPO policy"""
     env_id: str | None = None
-    """task to evaluate on; unset: the one the policy was trained on, or ForestryCrane-v0"""
+    """task to evaluate on, with its own options; unset: the policy's own, or ForestryCrane-v0"""
     trials: Annotated[int, Field(ge=1)] = 100
     """trials per log diameter"""
     diameters: tuple[Annotated[float, Field(ge=D_MIN, le=D_MAX)], ...] = DIAMETERS
@@ -80,7 +80,7 @@ class Args:
     video: Path | None = None
     """film one trial per diameter into this .mp4 or .gif"""
     viewer: bool = False
-    """show one trial after another in a window"""
+    """show one trial after another in a window, of the first diameter"""
     trial: Annotated[int, Field(ge=0)] = 0
     """number of the filmed trial, as in the column `trial` of --csv"""
     camera: Literal["overview", "side", "grapple"] = "overview"
@@ -233,7 +233,7 @@ def main() -> None:
     summary = __doc__.partition("\n\n")[0]
     args, flags = tyro.cli(
         Args,
-        description=summary + " --env.NAME changes an option of the task, as in the training.",
+        description=summary + " Behind the policies --env.NAME changes an option of the task.",
         return_unknown_args=True,
     )
     if (args.csv or args.json) and (args.video or args.viewer):
@@ -288,7 +288,7 @@ def main() -> None:
         print(f"\n{label} ({name}) on {', '.join([env_id, *changed])}, seed {args.seed}")
         print_table(table)
     if overall and not args.json:
-        print(LEGEND + PAPERS * any("paper %" in line for line in overall.values()))
+        print(LEGEND + (PAPERS if any("paper %" in line for line in overall.values()) else ""))
         if len(overall) > 1:
             print()
             print_table(overall)

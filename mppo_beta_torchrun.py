@@ -55,7 +55,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # cranes: s in training; up to 0.005, or above a step: the task's
+    physics_step: Factor = 0.01  # of cranes in training, s; 0 is the task's own (docs/training.md)
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -222,7 +222,7 @@ if __name__ == "__main__":
     count = {"initial": first_iteration - 1, "total": num_iterations, "disable": rank > 0}
     for iteration in (bar := tqdm(todo, **count)):
         # Schedules
-        left = 1.0 - (iteration - 1.0) / num_iterations
+        left = 1 - (iteration - 1) / num_iterations  # share of the run
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         epsilon = args.perturbation * max(0.0, 1 - (1 - left) / PERTURBED)
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter

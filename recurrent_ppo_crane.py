@@ -59,7 +59,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 64  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # cranes: s in training; up to 0.005, or above a step: the task's
+    physics_step: Factor = 0.01  # of cranes in training, s; 0 is the task's own (docs/training.md)
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -117,7 +117,7 @@ class Agent(nn.Module):
         new = len(obs)
         count = self.obs_count + new
         delta = obs.mean(0) - self.obs_mean
-        spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * new
+        spread = self.obs_var * self.obs_count + obs.var(0, correction=0) * new
         self.obs_var.copy_((spread + delta**2 * self.obs_count * new / count) / count)
         self.obs_mean.add_(delta * new / count)
         self.obs_count.copy_(count)
@@ -230,7 +230,7 @@ if __name__ == "__main__":
     todo = range(first_iteration, num_iterations + 1)
     for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
         # Schedules
-        left = 1.0 - (iteration - 1.0) / num_iterations
+        left = 1 - (iteration - 1) / num_iterations  # share of the run
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = 1 - (1 - args.gamma) / growth
@@ -332,7 +332,7 @@ if __name__ == "__main__":
         # Save after the evaluation: if a kill interrupts it, the resumed run repeats it
         if final or iteration % 10 == 0 or stop.received:
             runs.save(folder, args, envs, agent, optimizer, iteration)
-        if stop.received and not final:
-            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
+            if stop.received and not final:
+                raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
         bar.set_postfix_str(runs.brief(stats))
     writer.close()

@@ -184,8 +184,9 @@ class ScriptedCrane:
     ) -> tuple[np.ndarray, "ScriptedCrane"]:
         """Actions (N, 6) and the memory of this batch of trials. None starts new trials."""
         if state is None:
-            settings = self.settings or self.drives[obs.shape[1] > self.SLEW_FORCE]
-            state = type(self)(settings)
+            ideal, hydraulic = self.drives
+            drives = hydraulic if obs.shape[1] > self.SLEW_FORCE else ideal
+            state = type(self)(self.settings or drives)
             state.start(len(obs))
         return state.act(obs), state
 
@@ -221,11 +222,11 @@ class ScriptedCrane:
         q8_then = q8 + settings.latency * q8_speed
         thicker = np.clip(Q8_THIN - q8_then, 0.0, Q8_THIN - Q8_THICK)
         clearance = settings.clearance + settings.rise * thicker
-        level = np.abs(delta_p[:, 2] + clearance) < settings.level
-        near = (away < settings.near) & (np.abs(turn) < NEARLY_ALIGNED)
-        in_place = (away < settings.over) & level & (np.abs(turn) < settings.aligned)
+        at_level = np.abs(delta_p[:, 2] + clearance) < settings.level
+        near_by = (away < settings.near) & (np.abs(turn) < NEARLY_ALIGNED)
+        in_place = (away < settings.over) & at_level & (np.abs(turn) < settings.aligned)
         gripped = (q8 > Q8_CLOSED) & (q8_speed < settings.stalled)
-        self.phase[(self.phase == APPROACH) & near] = DESCEND
+        self.phase[(self.phase == APPROACH) & near_by] = DESCEND
         self.phase[(self.phase == DESCEND) & in_place] = CLOSE
         self.phase[(self.phase == CLOSE) & gripped] = LIFT
         hovering, lifting = self.phase == APPROACH, self.phase >= LIFT

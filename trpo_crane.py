@@ -19,7 +19,7 @@ Advantages A, returns R and the time limit are as in ppo_crane.py. A is scaled o
 Difficulty, width, horizon, reward_scale, delta and step size have schedules (docs/training.md).
 
     python trpo_crane.py  # the crane: minutes on two cores
-    python trpo_crane.py --env-id HalfCheetah-v5 --num-envs 8 --minibatch-size 64
+    python trpo_crane.py --env-id Hopper-v5 --num-envs 8 --minibatch-size 64 --eval-every 200
 """
 
 import os
@@ -63,7 +63,7 @@ class Args:
     env_id: str = "ForestryCrane-v0"  # Gymnasium task with flat Box spaces and episodes that end
     num_envs: Count = 128  # cranes simulated side by side
     env: Options = field(default_factory=Options)  # options of the task that --env-id names
-    physics_step: Factor = 0.01  # cranes: s in training; up to 0.005, or above a step: the task's
+    physics_step: Factor = 0.01  # of cranes in training, s; 0 is the task's own (docs/training.md)
 
     # algorithm
     num_steps: Count = 64  # steps per crane and rollout
@@ -120,7 +120,7 @@ class Agent(nn.Module):
         new = len(obs)
         count = self.obs_count + new
         delta = obs.mean(0) - self.obs_mean
-        spread = self.obs_var * self.obs_count + obs.var(0, unbiased=False) * new
+        spread = self.obs_var * self.obs_count + obs.var(0, correction=0) * new
         self.obs_var.copy_((spread + delta**2 * self.obs_count * new / count) / count)
         self.obs_mean.add_(delta * new / count)
         self.obs_count.copy_(count)
@@ -280,7 +280,7 @@ if __name__ == "__main__":
     todo = range(first_iteration, num_iterations + 1)
     for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
         # Schedules
-        left = 1.0 - (iteration - 1.0) / num_iterations
+        left = 1 - (iteration - 1) / num_iterations  # share of the run
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = 1 - (1 - args.gamma) / growth
@@ -329,9 +329,9 @@ if __name__ == "__main__":
         curvature = direction @ fisher_vector_product(agent, b_obs, args.cg_damping)(direction)
         delta = left * args.target_kl
         full_step = torch.sqrt(2 * delta / (curvature + 1e-12)) * direction
-        fraction, kl, reached = line_search(agent, full_step, batch, delta, args)
+        fraction, kl, new_surrogate = line_search(agent, full_step, batch, delta, args)
         stats = defaultdict(list)
-        stats["losses/policy_loss"] = [-reached]
+        stats["losses/policy_loss"] = [-new_surrogate]
         stats["losses/entropy"] = [old.entropy().sum(-1).mean().item()]
         stats["policy/std"] = [old.stddev.mean().item()]
         stats["losses/approx_kl"], stats["trpo/step_fraction"] = [kl], [fraction]
@@ -373,7 +373,7 @@ if __name__ == "__main__":
         # Save after the evaluation: if a kill interrupts it, the resumed run repeats it
         if final or iteration % 10 == 0 or stop.received:
             runs.save(folder, args, envs, agent, optimizer, iteration)
-        if stop.received and not final:
-            raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
+            if stop.received and not final:
+                raise SystemExit(f"stopped after update {iteration}; go on with --resume {folder}")
         bar.set_postfix_str(runs.brief(stats))
     writer.close()

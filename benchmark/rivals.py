@@ -1,7 +1,7 @@
 """What a user would pick instead, on the same cranes: other libraries, 10 minutes each.
 
     pip install -r benchmark/requirements.txt
-    python benchmark/rivals.py                                  # all, 4 hours on two cores
+    python benchmark/rivals.py                                  # all, over 3 hours on two cores
     python benchmark/rivals.py --rivals sb3_ppo sac --seeds 21  # some
     python benchmark/rivals.py --minutes 1.5 --results /tmp/rivals.csv    # does it work?
 

@@ -60,9 +60,14 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
     if not trials.crane_class(args.env_id) and args.env != Options():
         raise SystemExit(f"{args.env_id} is not the crane and has no --env options")
     if checkpoint:
+        given, before = (
+            asdict(a) | {f"env.{name}": value for name, value in asdict(a.env).items()}
+            for a in (args, default)
+        )
         fixed = ["env_id", "num_envs", "num_steps", "hidden_sizes", "lstm_size"]  # shapes
+        fixed += ["env.offset", "env.signed_yaw", "env.axes", "env.sensors"]  # observations
         for name in [*fixed, "log_std_init", "log_excess_init"]:  # the checkpoint has the width
-            if getattr(args, name, None) != (was := getattr(default, name, None)):
+            if given.get(name) != (was := before.get(name)):
                 raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
         cranes, was = trials.crane_class(args.env_id), checkpoint["task"].get("revision")
         if cranes and cranes.REVISION != was:

@@ -177,7 +177,9 @@ def evaluate(
     Cranes are evaluated on the full task, without curriculum. Rates are shares in [0, 1].
     """
     if not crane_class(env_id):
-        results = run_trials(policy, make_envs(env_id, trials), seed)
+        envs = make_envs(env_id, trials)
+        results = run_trials(policy, envs, seed)
+        envs.close()
         return {"episodic_return": results["episodic_return"].mean().item()}
     diameters, seeds = monte_carlo_trials(seed, trials)
     envs = make_envs(env_id, len(seeds), threads, options, diameter=diameters)

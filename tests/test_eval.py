@@ -53,11 +53,14 @@ def trained(tmp_path_factory):
     return next((folder / "runs").iterdir())
 
 
-def test_a_resumed_run_keeps_its_options(trained, monkeypatch):
-    line = f"ppo_crane.py --resume {trained} --total-timesteps 99"
+def test_a_resumed_run_keeps_its_options_and_what_it_observes(trained, monkeypatch):
+    line = f"ppo_crane.py --resume {trained} --total-timesteps 99 --env.pose-noise step"
     monkeypatch.setattr(sys, "argv", line.split())
     args, _ = runs.parse(importlib.import_module("ppo_crane").Args, "")
-    assert (args.env_id, args.env.axes) == (QUICK, "world")
+    assert (args.env_id, args.env.axes, args.env.pose_noise) == (QUICK, "world", "step")
+    monkeypatch.setattr(sys, "argv", f"{line} --env.axes crane".split())
+    with pytest.raises(SystemExit, match="^--resume: --env.axes must stay world$"):
+        runs.parse(importlib.import_module("ppo_crane").Args, "")
 
 
 # ---- trials
