@@ -280,7 +280,7 @@ if __name__ == "__main__":
     todo = range(first_iteration, num_iterations + 1)
     for iteration in (bar := tqdm(todo, initial=first_iteration - 1, total=num_iterations)):
         # Schedules
-        left = 1 - (iteration - 1) / num_iterations  # share of the run
+        left = 1 - (iteration - 1) / num_iterations  # share of the run that is to come
         optimizer.param_groups[0]["lr"] = left * args.learning_rate
         growth = args.horizon_growth ** max(0.0, 1 - left / 0.75)  # 1 in the first quarter
         gamma = 1 - (1 - args.gamma) / growth
