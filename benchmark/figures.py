@@ -101,7 +101,7 @@ def run(paths: Positional[tuple[Path, ...]], figure: Path = Path("curves.svg")) 
 
 
 def curves() -> None:
-    """Draw learning_curves.svg, results/curves/ and results/levels/, and loading_curves.svg."""
+    """Draw learning_curves.svg (results/curves/ and levels/), loading_ and printed_curves.svg."""
     rows = {"success": "eval_success_rate", "gentle success": "eval_gentle_rate"}
     found, columns = read_curves("curves") | read_curves("levels"), {}
     for level in LEVELS:
@@ -109,15 +109,17 @@ def curves() -> None:
         lines = {label: [*found[name].values()] for name, label in names.items() if name in found}
         columns[f"steps [million], {level} level"] = (lines, "steps", 1e-6)
     panels(columns, rows, FIGURES / "learning_curves.svg")
-    if not (found := read_curves("loading")):
-        return
-    lines = {}
-    for name, of_seed in found.items():
-        script, level = name.rsplit("_", 1)
-        lines[f"{LABELS[script]}, {level}"] = [*of_seed.values()]
-    columns = {"steps [million], loading cycle": (lines, "steps", 1e-6)}
     rows = {"success": "eval_success_rate", "return": "eval_episodic_return"}
-    panels(columns, rows, FIGURES / "loading_curves.svg")
+    for folder, task in (("loading", "loading cycle"), ("printed", "printed reward")):
+        lines = {
+            label + name.removeprefix(script).replace("_", ", "): [*of_seed.values()]
+            for name, of_seed in read_curves(folder).items()
+            for script, label in LABELS.items()
+            if name.startswith(script)
+        }
+        if lines:
+            columns = {f"steps [million], {task}": (lines, "steps", 1e-6)}
+            panels(columns, rows, FIGURES / f"{folder}_curves.svg")
 
 
 def levels() -> None:

@@ -196,9 +196,11 @@ def timed() -> str:
 
 
 def ablations() -> str:
-    """ablations/: success of mPPO with one ingredient changed, one number a seed."""
-    lines, curves = [], read_curves("ablations")
-    for name, (label, _, _) in runs.ABLATIONS.items():
+    """ablations/ and printed/: success of mPPO with something changed, one number a seed."""
+    lines, curves = [], read_curves("ablations") | read_curves("printed")
+    labels = {name: label for name, (label, _, _) in runs.ABLATIONS.items()}
+    labels[runs.MPPO] = "reward and observations as printed, 25 million steps"
+    for name, label in labels.items():
         of_seed = curves.get(name, {})
         ends = ("eval_success_rate", "eval_gentle_rate")
         cells = [joined((100 * run[end][-1] for run in of_seed.values()), 1) for end in ends]
