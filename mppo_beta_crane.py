@@ -4,8 +4,8 @@ The paper's own algorithm (Vu et al., Sec. IV-C). It differs from PPO in two poi
 
 - The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n:
   no action is outside the limits (Chou et al., 2017). An evaluation takes the mean of the Beta.
-- In training each sampled action is perturbed, Eq. (robust ppo): a_n <- clip(a_n + g, 0, 1) with
-  g ~ U(-eps, eps). Here eps falls to 0 in the first part of the run.
+- In training each sampled action is perturbed, Eq. (robust ppo): with g ~ U(-eps, eps)
+  a_n <- clip(a_n + g, A_MIN, 1 - A_MIN). Here eps falls to 0 in the first part of the run.
 
 The rest is PPO with generalized advantage estimation (Schulman et al., 2016, 2017):
 

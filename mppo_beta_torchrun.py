@@ -5,7 +5,7 @@ This is mppo_beta_crane.py, except that each rank has a share of the cranes and 
 divergence that stops an update, and the statistics of advantages and observations. So all have the
 same weights. The observation normalizer changes after each rollout and not in it, so the first
 rollout has raw observations. Rank 0 evaluates, and writes what it has seen.
-Several machines, and what to expect of more cores: docs/speed.md.
+Several machines: docs/speed.md.
 
     torchrun --standalone --nproc-per-node 2 mppo_beta_torchrun.py
 """

@@ -134,8 +134,7 @@ class Run(NamedTuple):
     @property
     def alone(self) -> bool:
         """Whether it has two cores for itself, as README's command has: its minutes count."""
-        both = self.folder == "curves" or (self.folder == "levels" and self.seed == 21)
-        return both and self.script == MPPO
+        return (self.folder, self.script) == ("curves", MPPO)
 
 
 RUNS = [Run(*training, seed) for *training, seeds in TRAININGS for seed in seeds]

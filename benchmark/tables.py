@@ -122,7 +122,7 @@ def loading() -> str:
         cells = [joined(numbers(rows, name), 1, "-") for name in names]
         lines.append([*line, *cells, causes(rows)])
     for row in read_rows(RESULTS / "loading.csv"):
-        cells = [row[name] for name in names]
+        cells = [joined(numbers([row], name), 1) for name in names]
         lines.append([row["level"], "scripted", "", "", *cells, causes([row])])
     header = ["level", "method", "steps [million]", "seeds", "success", "gentle", "loaded [s]"]
     return table([*header, "oil [l]", "energy [kJ]", "failures by cause"], lines)
@@ -162,37 +162,32 @@ def paper() -> str:
 
 
 def costs() -> str:
-    """levels.csv: metrics of the shipped policies and the scripted crane on their own levels."""
+    """levels.csv: metrics of shipped policies on their own levels, and success on the others."""
     metrics, lines = ["oil [l]", "energy [kJ]", "up [s]", "swing [rad]"], []
-    for row in read_rows(RESULTS / "levels.csv"):
-        if row["trained_on"] == row["evaluated_on"]:
-            cells = [f"{float(row[name]):.3g}" if row[name] else "" for name in metrics]
-            lines.append([row["trained_on"], row["method"], *cells])
-    methods = [*LABELS.values(), "scripted"]
-    lines.sort(key=lambda line: ([*LEVELS].index(line[0]), methods.index(line[1])))
-    return table(["level", "method", *metrics], lines)
+    rows = read_rows(RESULTS / "levels.csv")
+    of = {(row["method"], row["trained_on"], row["evaluated_on"]): row for row in rows}
+    for level, method in product(LEVELS, [*LABELS.values(), "scripted"]):
+        own = of[method, level, level]
+        cells = [f"{float(own[name]):.3g}" for name in metrics]
+        for other in ("hydraulic", "randomized"):
+            row = of.get((method, level, other))
+            cells.append(joined(numbers([row], "success"), 1) if row else "")
+        lines.append([level, method, *cells])
+    header = ["level", "method", *metrics, "success, hydraulic", "success, randomized"]
+    return table(header, lines)
 
 
 def timed() -> str:
-    """curves/ and levels/: minutes of mPPO alone on two cores, without evaluations."""
-    lines, curves = [], read_curves("curves") | read_curves("levels")
-    for level in LEVELS:
-        name = runs.MPPO if level == "ideal" else f"{runs.MPPO}_{level}"
-        alone = [run.seed for run in runs.RUNS if run.alone and run.name == name]
-        of_seed = {seed: run for seed, run in curves.get(name, {}).items() if seed in alone}
-        if not of_seed:
-            continue
-        whole, kept = [], []
-        for run in of_seed.values():
-            success, minutes = run["eval_success_rate"], run["minutes"]
-            good = [k for k in range(len(success) - 1) if success[k:].min() >= 0.95]
-            whole.append(minutes[-1])
-            kept.append(next((minutes[k] for k in good if success[k] >= 0.963), np.nan))
-        steps = f"{run['steps'][-1] / 1e6:.2f}"
-        minutes = with_range(np.median(whole), whole)
-        lines.append([level, ", ".join(map(str, of_seed)), steps, minutes, joined(kept, 1)])
-    header = ["level", "seeds", "steps [million]", "training [min]", "96.3 % kept after [min]"]
-    return table(header, lines)
+    """curves/: minutes of mPPO alone on two cores, without evaluations, one number a seed."""
+    whole, kept, of_seed = [], [], read_curves("curves")[runs.MPPO]
+    for run in of_seed.values():
+        success, minutes = run["eval_success_rate"], run["minutes"]
+        good = [k for k in range(len(success) - 1) if success[k:].min() >= 0.95]
+        whole.append(minutes[-1])
+        kept.append(next((minutes[k] for k in good if success[k] >= 0.963), np.nan))
+    lines = [["training [min]", *(f"{x:.1f}" for x in whole)]]
+    lines.append(["96.3 % kept after [min]", *(joined([x], 1) for x in kept)])
+    return table(["training seed", *map(str, of_seed)], lines)
 
 
 def ablations() -> str:
@@ -280,13 +275,15 @@ def rivals() -> str:
 
 def held() -> str:
     """held.csv: success after 9 s / after ten more seconds without command. contacts.csv: SDF."""
-    of = {(r["method"], r["level"]): r for r in read_rows(RESULTS / "held.csv")}
-    sdf = {row["method"]: row["success"] for row in read_rows(RESULTS / "contacts.csv")}
+    of = {(row["method"], row["level"]): row for row in read_rows(RESULTS / "held.csv")}
+    sdf = {row["method"]: row for row in read_rows(RESULTS / "contacts.csv")}
     lines = []
     for method in [*LABELS.values(), "scripted"]:
-        rows = [of.get((method, level), {"success": "", "held": ""}) for level in LEVELS]
-        cells = [f"{row['success']} / {row['held']}" for row in rows]
-        lines.append([method, *cells, sdf.get(method, "")])
+        rows = [of[method, level] for level in LEVELS]
+        cells = [
+            " / ".join(joined(numbers([row], c), 1) for c in ("success", "held")) for row in rows
+        ]
+        lines.append([method, *cells, joined(numbers([sdf[method]], "success"), 1)])
     return table(["policy", *LEVELS, "ideal, SDF contacts"], lines)
 
 
