@@ -55,7 +55,9 @@ def test_a_film_shows_the_trials_that_are_evaluated(opengl, tmp_path, file):
         assert run_trials(evaluated, envs, seeds[2:])["success"] == [diameter == 0.3]
     np.testing.assert_array_equal(filmed.seen, evaluated.seen)
     frames = imageio.imread(path)
-    assert frames.shape[1:] == (72, 128, 3) and len(frames) >= 12  # 20 a second
+    most = 32  # 20 a second of both trials; GIF merges equal ones
+    assert frames.shape[1:] == (72, 128, 3) and 12 <= len(frames) <= most
+    assert len(frames) == most or path.suffix == ".gif"
     assert np.abs(frames[0].astype(int) - frames[5]).max() > 30 and frames[0].std() > 10
     filmed.fails, before = True, path.read_bytes()
     with pytest.raises(RuntimeError, match="lost"):

@@ -11,8 +11,8 @@ from crane_env import SERVOS, CraneVectorEnv
 from crane_utils.metrics import Metrics
 from hydraulic_crane import HydraulicCraneVectorEnv
 
-# how far the lab's own model of one axis is from its records (assets/README.md, Drives)
-LABS_FIT = {"slew": 0.23, "boom": 0.23, "arm": 0.40, "telescope": 0.79, "rotator": 0.09}
+# how far this model is from the machine's records (assets/README.md, Drives)
+FIT = {"slew": 0.16, "boom": 0.09, "arm": 0.13, "telescope": 0.14, "rotator": 0.02}
 AREAS = np.array([  # m^3/rad, m^3/m, or m^2 of a cylinder, at -1 and +1
     [12.724e-4, 9.032e-3, 5.026e-3, 2.592e-3, 1.4324e-4, 4.61e-4],
     [12.724e-4, 15.394e-3, 12.724e-3, 3.849e-3, 1.4324e-4, 7.64e-4],
@@ -25,16 +25,16 @@ def standing(q2, q3, q4, q8, n=1, cranes=HydraulicCraneVectorEnv, **options):
     return place(np.tile(q, (n, 1)), 0.3, cranes=cranes, **options)
 
 
-@pytest.mark.parametrize("step", [0.005, 0.01])  # physics of the task, of training
-@pytest.mark.parametrize("axis", LABS_FIT)
-def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis, step):
-    """Both ways, closer at every listed instant than the model of the lab that measured it."""
+@pytest.mark.parametrize("step, worse", [(0.005, 0.005), (0.01, 0.06)])  # the task's, training's
+@pytest.mark.parametrize("axis", FIT)
+def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis, step, worse):
+    """Both ways, as close at every listed instant as documented."""
     measured, *_ = AXES[axis]
     at = np.round(INSTANTS[: len(measured)] / step).astype(int) - 1
     for action in (-0.4, 0.4):
         answer = response(axis, action, step=step)
         assert len(answer) == round(1.25 / step)
-        assert np.abs(answer[at] - measured).max() < LABS_FIT[axis]
+        assert np.abs(answer[at] - measured).max() < FIT[axis] + worse
 
 
 def test_nothing_moves_within_the_dead_time():
@@ -58,6 +58,17 @@ def test_a_longer_dead_time_is_not_cut(step, monkeypatch):
     assert envs.act[0, 0] == pytest.approx(before, abs=1e-9)
     hold(envs, np.eye(6)[0], 4)
     assert envs.act[0, 0] > before + 1e-3
+
+
+def test_the_pump_shares_its_oil():
+    """All joints at full speed ask for more than it gives: each gets the same fraction."""
+    envs = HydraulicCraneVectorEnv(1, env_threads=1)
+    envs.reset(seed=0)
+    full = np.array([[0.802, 0.239, 0.326, 0.400, 2.12, 1.8]])
+    envs.valve_speed[:] = full
+    given = envs.oil_speed(np.arange(1), full, 0.02)
+    oil = hydraulic.oil_per_movement(envs.levers, given, np.zeros((1, 6)))
+    assert np.ptp(given / full) < 1e-9 and np.sum(oil * given) == pytest.approx(1.33e-3)
 
 
 def test_levers_of_the_cylinders():

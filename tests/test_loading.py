@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import eval_crane
 import loading_crane
 from crane_env import GENTLE_FORCE, CraneState, CraneVectorEnv
 from crane_utils.scripted_loading import ScriptedLoadingCrane
@@ -104,6 +103,8 @@ ON_THE_WAY = (-6.6 * np.cos(1.1), -6.6 * np.sin(1.1), 1.625, np.pi / 4)
         ((-4.1, 0, 1.4, np.pi / 4), True, dict(height=2, swing=3, along=1, middle=1.5, lower=2)),
         ((-4.1, 0, 1.4, np.pi / 8), True, dict(height=2, swing=3, along=2, middle=1.5, lower=4,
                                                let_go=6, release=4.5)),
+        ((-4.1, 0.6, 1.4), False, dict(height=2, swing=3, along=2, middle=1.5 / np.e, lower=4,
+                                       let_go=12, release=9)),  # it rolled out of the jaws
     ],
 )  # fmt: skip
 def test_reward(pose, held, expected):
@@ -166,30 +167,18 @@ def test_a_hit_is_seen_in_every_physics_step():
     assert envs.bed_speed == pytest.approx(np.sqrt(2 * 9.81 * heights), rel=0.1)
 
 
-def test_a_log_in_the_middle_of_the_bunk_pays_more_than_one_beside_a_stake():
+def test_low_in_the_bunk_squeezing_less_pays():
     envs, pay = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False), []
-    for aside in (0.0, 0.6):  # MIDDLE_MISS
-        put(envs, -4.1, aside, 1.4)
-        pay.append(envs.step(IDLE)[-1]["r_middle"][0])
-    assert pay[0] == pytest.approx(loading_crane.MIDDLE_WEIGHT, rel=0.01)
-    assert pay[1] == pytest.approx(pay[0] / np.e, rel=0.02)
-
-
-def test_low_in_the_bunk_squeezing_less_pays_and_rolling_costs_nothing():
-    envs, terms = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False), []
-    for squeeze, aside, command in [(1.0, 0.0, 0.9), (0.0, 0.0, 0.0), (0.0, 0.3, 0.0)]:
-        put(envs, -4.1, aside, 1.4)
+    for squeeze, command in [(1.0, 0.9), (0.0, 0.0)]:
+        put(envs, -4.1, 0, 1.4)
         envs.qpos[:, 8:10] = 2.0  # rad, half open
         lead = envs.force_limit[1, :, 6:] / envs.servo_kp[:, 6:]  # rad, at full force
         envs.act[:, 6:] = envs.qpos[:, 8:10] + squeeze * lead
         envs.command[:, 5] = command  # rad/s, half of the jaws' speed limit
         info = envs.measure(state := envs.state()) | {"termination": np.array(["none"])}
-        terms.append(envs.reward_terms(state, info))
-    full, none, rolled = terms
-    assert full["r_let_go"] == pytest.approx(loading_crane.LET_GO_WEIGHT / 8)  # (1 - 1/2) / 4
-    assert none["r_let_go"] == pytest.approx(loading_crane.LET_GO_WEIGHT / 2)
-    for name in ("r_swing", "r_along", "r_lower", "r_let_go", "r_release"):
-        assert rolled[name] == pytest.approx(none[name], rel=1e-6), name
+        pay.append(envs.reward_terms(state, info)["r_let_go"][0])
+    shares = [(1 - 1 / 2) / 4, (2 - 0) / 4]
+    assert pay == pytest.approx(np.multiply(loading_crane.LET_GO_WEIGHT, shares))
 
 
 def test_force_on_the_truck_counts():
@@ -204,13 +193,13 @@ def test_force_on_the_truck_counts():
     assert info["ground_peak"] > GENTLE_FORCE
 
 
-@pytest.mark.parametrize("cranes, ends", [(CraneVectorEnv, True), (LoadingCraneVectorEnv, False)])
-def test_a_stop_that_gives_under_the_log_ends_nothing(cranes, ends):
-    """A telescope 2.5 cm inside its stop, where a log in the jaws may push it."""
-    envs = cranes(1, env_threads=1)
+@pytest.mark.parametrize("beyond, ends", [(0.029, False), (0.031, True)])
+def test_a_stop_that_gives_under_the_log_ends_nothing(beyond, ends):
+    """A telescope inside its stop, where a log in the jaws may push it, m."""
+    envs = LoadingCraneVectorEnv(1, env_threads=1)
     envs.reset(seed=0)
     state = envs.state()
-    state.q[0, 3] = -0.025
+    state.q[0, 3] = -beyond
     info = envs.measure(state) | dict.fromkeys(("time", "diverged", "safe"), np.zeros(1))
     assert envs.rules(state, info)["joint_limit_q4"] == ends
 
@@ -275,25 +264,27 @@ def test_easy_starts_of_the_first_cranes_hold_the_log(cranes):
     """15 % of the cranes at difficulty 0, fewer at 0.5, none at 1. Nothing slips or is repeated."""
     diameter = np.resize(np.linspace(0.3, 0.8, 4), 54)
     envs = cranes(54, env_threads=1, retry=1.0, diameter=diameter)
-    for difficulty, held in [(0.0, 8), (0.5, 4), (1.0, 0)]:
+    for difficulty, held in [(1.0, 0), (0.5, 4), (0.0, 8)]:
         envs.difficulty = difficulty
         envs.reset(seed=7)
         high = envs.state().log_centre[:, 2] > 2.5
         np.testing.assert_array_equal(high, np.arange(54) < held)
-        for step in range(65):  # longer than a log may take to be reached
-            ends = envs.step(np.zeros((54, 6)))[-1]["termination"]
-            assert (ends[:held] == "none").all(), ends
-            assert step or (np.linalg.norm(envs.qvel[:held, 10:13], axis=-1) < 1).all()
-        state = envs.state()
-        assert state.touching[:held].all() and (state.log_centre[:held, 2] > 2.0).all()
+    for step in range(65):  # longer than a log may take to be reached
+        ends = envs.step(np.zeros((54, 6)))[-1]["termination"]
+        assert (ends[:8] == "none").all(), ends
+        assert step or (np.linalg.norm(envs.qvel[:8, 10:13], axis=-1) < 1).all()
+    state = envs.state()
+    assert state.touching[:8].all() and (state.log_centre[:8, 2] > 2.0).all()
 
 
 def test_half_of_the_held_logs_start_near_the_bunk():
-    envs = LoadingCraneVectorEnv(400, env_threads=1, difficulty=0.5)  # 30 hold their log
+    """Half have less than an eighth of the way to go, by the slew's angle."""
+    envs, shares = LoadingCraneVectorEnv(8, env_threads=1, difficulty=0.0), []
     envs.reset(seed=7)
-    full = np.array([start[0][0] for start in envs.starts[:30]])  # rad, slew of the lift's start
-    way = (envs.state().q[:30, 0] + np.pi) / (full + np.pi)
-    assert way.max() < 1 and 10 <= (way < 1 / 8).sum() <= 20
+    for _ in range(1000):
+        q, *_ = envs.draw_episode(0)
+        shares.append((q[0] + np.pi) / (envs.starts[0][0][0] + np.pi))  # of the lift's start
+    assert max(shares) < 1 and np.mean(np.less(shares, 1 / 8)) == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_held_log_that_is_dropped_is_lost_and_its_start_is_not_repeated():
@@ -325,24 +316,17 @@ def test_a_log_must_be_lifted_within_12_s():
     assert envs.step(np.zeros((2, 6)))[-1]["termination"][0] == "not_lifted"
 
 
-def test_the_scripted_crane_that_the_task_names_loads_on_hydraulic_drives():
-    env_id = "ForestryCraneHydraulicLoading-v0"
-    policy, *_ = eval_crane.load_policy("scripted", env_id)
-    diameters, seeds = monte_carlo_trials(10_000, 1)
-    results = run_trials(policy, make_envs(env_id, 6, 1, diameter=diameters), seeds)
-    assert results["success"].sum() >= 3  # 4; with settings for ideal servos 2
-
-
 def test_the_scripted_crane_loads_and_later_stages_pay_more():
     diameters, seeds = monte_carlo_trials(10_000, 1)
     envs = make_envs("ForestryCraneLoading-v0", 6, 1, diameter=diameters)
     results = run_trials(ScriptedLoadingCrane(), envs, seeds)
     assert results["success"].all() and (results["termination"] == "loaded").all(), results
-    obs, _ = envs.reset(seed=seeds)
+    one = make_envs("ForestryCraneLoading-v0", 1, 1, diameter=diameters[:1])
+    obs, _ = one.reset(seed=seeds[:1])
     policy, memory, pay = ScriptedLoadingCrane(), None, {}
     for _ in range(250):
         actions, memory = policy.predict(obs, memory)
-        obs, reward, terminated, _, info = envs.step(actions)
+        obs, reward, terminated, _, info = one.step(actions)
         if terminated[0]:
             break
         pay.setdefault(memory.phase[0], []).append((reward - info["r_ground"])[0])

@@ -3,6 +3,7 @@
 import importlib.util
 import subprocess
 import sys
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -129,6 +130,8 @@ def test_small_swing_is_that_of_a_damped_compound_pendulum(index, joint, damping
     k = np.flatnonzero((angles[:-1] > 0) != (angles[1:] > 0))[:4]
     crossings = 0.005 * (k + angles[k] / (angles[k] - angles[k + 1]))
     assert 2 * np.mean(np.diff(crossings)) == pytest.approx(period, rel=0.02)
+    first, *_, last = (np.abs(angles[a:b]).max() for a, b in pairwise(k))  # a period apart
+    assert last / first == pytest.approx(np.exp(-damping * period / (2 * inertia)), abs=0.01)
 
     starts = rest + friction / stiffness * np.array([[0.5], [3.0]]) * off
     held = place(starts)

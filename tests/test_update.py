@@ -107,6 +107,8 @@ def check_start(weights, of_beta):
         weight = weights[f"{layer}.weight"]
         weight = weight if len(weight) <= len(weight.T) else weight.T
         close(weight @ weight.T, scale * torch.eye(len(weight)), layer)
+        if (layer, of_beta) != ("actor.4", True):
+            assert not weights[f"{layer}.bias"].any()
     width = weights["actor.4.bias"] - 0.3 if of_beta else weights["log_std"] + 0.5
     close(width, torch.zeros_like(width), "width")
 
