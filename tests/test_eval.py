@@ -264,9 +264,12 @@ def test_a_film_is_of_the_trial_that_was_asked_for(judge, monkeypatch, trained):
     ((_, name, env_id, options, path, diameters), how) = films[0]
     assert (name, env_id, path.name, diameters) == ("ppo_crane.py", QUICK, "a.mp4", (0.3,))
     assert (options["axes"], options["offset"]) == ("world", "minus")
-    assert how == {
-        "seed": 60000, "trial": 17, "camera": "side", "width": 640, "deterministic": False
-    }  # fmt: skip
+    scene = {"seed": 60000, "trial": 17, "camera": "side", "deterministic": False}
+    assert how == scene | {"width": 640}
+    monkeypatch.setattr(film, "window", lambda *args, **kwargs: films.append((args, kwargs)))
+    judge(line.replace("--video a.mp4", "--viewer"), "--stochastic")
+    assert films[1][0][1:3] == ("ppo_crane.py", QUICK) and films[1][0][4] == 0.3
+    assert films[1][1] == scene
 
 
 # ---- policies
