@@ -122,7 +122,7 @@ def loading() -> str:
         cells = [joined(numbers(rows, name), 1, "-") for name in names]
         lines.append([*line, *cells, causes(rows)])
     for row in read_rows(RESULTS / "loading.csv"):
-        cells = [joined(numbers([row], name), 1) for name in names]
+        cells = [f"{float(row[name]):.1f}" for name in names]
         lines.append([row["level"], "scripted", "", "", *cells, causes([row])])
     header = ["level", "method", "steps [million]", "seeds", "success", "gentle", "loaded [s]"]
     return table([*header, "oil [l]", "energy [kJ]", "failures by cause"], lines)
@@ -171,7 +171,7 @@ def costs() -> str:
         cells = [f"{float(own[name]):.3g}" for name in metrics]
         for other in ("hydraulic", "randomized"):
             row = of.get((method, level, other))
-            cells.append(joined(numbers([row], "success"), 1) if row else "")
+            cells.append(f"{float(row['success']):.1f}" if row else "")
         lines.append([level, method, *cells])
     header = ["level", "method", *metrics, "success, hydraulic", "success, randomized"]
     return table(header, lines)
@@ -280,10 +280,8 @@ def held() -> str:
     lines = []
     for method in [*LABELS.values(), "scripted"]:
         rows = [of[method, level] for level in LEVELS]
-        cells = [
-            " / ".join(joined(numbers([row], c), 1) for c in ("success", "held")) for row in rows
-        ]
-        lines.append([method, *cells, joined(numbers([sdf[method]], "success"), 1)])
+        cells = [f"{float(row['success']):.1f} / {float(row['held']):.1f}" for row in rows]
+        lines.append([method, *cells, f"{float(sdf[method]['success']):.1f}"])
     return table(["policy", *LEVELS, "ideal, SDF contacts"], lines)
 
 
