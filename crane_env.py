@@ -5,9 +5,9 @@
 
 The crane slews at q1, lifts at q2 (boom) and q3 (arm) and reaches with q4 (two equal telescope
 stages). Two passive joints q5 and q6 let the grapple hang: a rotator q7 with two jaws q8. A log
-lies somewhere in front of the crane. Within 6 s the grapple must reach it. At the end of the 9 s it
-must hang in the jaws. Sections and equations are those of Vu et al. (README.md). assets/README.md
-has the source of every number, docs/environment.md the task on one page.
+lies somewhere in front of the crane. Within 6 s the grapple must reach it. At the end of the 9 s
+the log must hang in the jaws. Sections and equations are those of Vu et al. (README.md).
+assets/README.md has the source of every number, docs/environment.md the task on one page.
 
 Observation, float32, `Box` of shape (18,):
 
@@ -85,7 +85,7 @@ ACTUATED = [0, 1, 2, 3, 6, 7]  # the six of our q1 ... q8 that an action moves
 
 LOG_LENGTH = 2.75  # m (paper)
 LOG_DENSITY = 650.0  # kg/m^3, the low end of green spruce; the paper does not give it
-D_MIN, D_MAX = 0.3, 0.8  # m, log diameter (paper)
+D_MIN, D_MAX, R_MIN, R_MAX = 0.3, 0.8, 5.5, 7.5  # m, log diameter (paper), way from slew axis
 REACH_DISTANCE = 0.35  # m, epsilon of d_combine, not published (docs/learned.md, Reward)
 LOG_RANGE = 8.0  # m, largest distance between grapple centre and log centre (paper)
 MIN_CLEARANCE = 0.1  # m of air under the log's lowest point
@@ -146,7 +146,7 @@ def sample_start(rng: Generator) -> tuple[Array, Array, float]:
     q1, azimuth = rng.uniform(-2 * np.pi / 3, -np.pi / 3, size=2)
     swing5, swing6 = rng.uniform(-0.05, 0.05, size=2)
     q7, yaw = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
-    q8, radius, diameter = rng.uniform([0.05, 5.5, D_MIN], [0.6, 7.5, D_MAX])
+    q8, radius, diameter = rng.uniform([0.05, R_MIN, D_MIN], [0.6, R_MAX, D_MAX])
     q = np.array([q1, q2, q3, q4, np.pi / 2 - q2 - q3 + swing5, np.pi / 2 + swing6, q7, q8])
     return q, np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), yaw]), diameter
 
@@ -161,7 +161,7 @@ def ease_start(
     """
     q1, q7, (x, y, yaw) = q[0], q[6], log_pose
     out, _ = tip_position(*q[1:4])
-    easiest = np.array([np.clip(out, 5.5, 7.5), q1, q1 - q7, (D_MIN + D_MAX) / 2])
+    easiest = np.array([np.clip(out, R_MIN, R_MAX), q1, q1 - q7, (D_MIN + D_MAX) / 2])
     way = np.array([np.hypot(x, y), np.arctan2(y, x), yaw, diameter]) - easiest
     way[2] = (way[2] + np.pi / 2) % np.pi - np.pi / 2  # a log is the same after half a turn
     radius, azimuth, yaw, diameter = easiest + difficulty * way
@@ -321,7 +321,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     HOLD_TIME = 0.5  # s at the end of an episode in which `conditions` must hold
     LIMIT_TOLERANCE = 0.02  # rad, m; at full servo force a soft stop gives 0.005 rad or 0.012 m
     GOALS: tuple[str, ...] = ()  # names of `rules` that end an episode well where it is `safe`
-    COARSE_HITS = 0.5  # forces of hits count times (larger / exact step)^this (docs/training.md)
+    COARSE_HITS = 0.5  # hits count times (physics step / crane.xml's)^this (docs/training.md)
     PIECE = 0.025  # s between two clamps of the integrators (assets/README.md)
     # In the full task r_ground falls linearly from 0 at half of GENTLE_FORCE to -GROUND_WEIGHT at
     # GENTLE_FORCE, never below GROUND_MOST times that. Stiff servos hit hard or not at all.
@@ -334,7 +334,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         diameter: float | Array | None = None,  # one or (N,), m; None draws it
         difficulty: float = 1.0,
         retry: float = 0.0,
-        physics_step: float = 0.0,  # s, if above crane.xml's 0.005, at most a step, and not sdf
+        physics_step: float = 0.0,  # s; ignored up to crane.xml's 0.005, above a step, and for sdf
         env_threads: int = 0,  # physics threads, 0 for all cores
         render_mode: Literal["human", "rgb_array"] | None = None,
         camera: Literal["overview", "side", "grapple"] = "overview",
@@ -488,7 +488,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return values
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
-        """New episodes of all cranes or of options["reset_mask"] (N,), from N seeds or one."""
+        """New episodes of all cranes or of options["reset_mask"] (N,). N seeds or one: for all."""
         if seed is not None or self.rngs is None:
             if np.ndim(seed) == 0:  # one, or None: crane i draws from its i-th child
                 seed = SeedSequence(seed).spawn(self.num_envs)
@@ -552,7 +552,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         radius, (x, y, yaw) = diameter / 2, log_pose.T
-        # the log's own z axis lies along (-sin yaw, cos yaw, 0): a turn by yaw after one by -pi/2
+        # the log's z axis lies along (-sin yaw, cos yaw, 0): -pi/2 about x, then yaw about z
         cos, sin = np.cos(yaw / 2) / np.sqrt(2), np.sin(yaw / 2) / np.sqrt(2)
         self.batch.joint("log").qpos[ids] = np.stack([x, y, radius, cos, -cos, -sin, sin], axis=-1)
         self.qpos[np.ix_(ids, JOINTS)] = q
@@ -636,7 +636,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return CraneState(q, dq, *poses, touch > 0, 2 * self.log_radius, carried)
 
     def bounded_observation(self, state: CraneState, diverged: Array | bool = False) -> Array:
-        """`observe` as float32 (N, n), clipped to the space; so are zeros for diverged cranes."""
+        """`observe` as float32 (N, n): zeros for diverged cranes, all clipped to the space."""
         space, obs = self.observation_space, self.observe(state)
         if obs.shape != space.shape:
             raise ValueError(f"observe gives {obs.shape}, observation_limits {space.shape}")

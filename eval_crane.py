@@ -82,7 +82,7 @@ class Args:
     viewer: bool = False
     """show one trial after another in a window, of the first diameter"""
     trial: Annotated[int, Field(ge=0)] = 0
-    """number of the filmed trial, as in the column `trial` of --csv"""
+    """number of the filmed or first shown trial, as in the column `trial` of --csv"""
     camera: Literal["overview", "side", "grapple"] = "overview"
     """camera of the film and of the window"""
     width: Annotated[int, Field(ge=64, le=1920, multiple_of=2)] = 640

@@ -46,12 +46,12 @@ OIL = np.array(
      [12.724e-4, 15.394e-3, 12.724e-3, 1.257e-3, 1.4324e-4, 7.64e-4]]
 )  # fmt: skip
 FULL_TELESCOPE = 3.849e-3  # m^3/m of the telescope's way out under a load too heavy for that
-SERVOS_OF_ACTION = np.array([1, 1, 1, 2, 1, 2])  # how many share the force of the oil
-FIRST_SERVO = [0, 1, 2, 3, 5, 6]  # of each command: the first telescope stage, the outer jaw
+SERVOS_OF_ACTION = np.bincount(ACTION_OF_SERVO)  # how many share the force of the oil
+FIRST_SERVO = [ACTION_OF_SERVO.index(k) for k in range(6)]  # first stage, outer jaw
 PASSIVE = [4, 5]  # of our q1 ... q8
 
 # What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
-# damping are wide, so their logarithms are uniform. All else is uniform. joint_error: rad, not q4.
+# damping are wide: their logarithms are uniform. All else is uniform. joint_error: rad, q4: none.
 DRAWN = {
     "stiffness": (STIFFNESS, [2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4],
                   [3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),
@@ -163,7 +163,7 @@ class HydraulicCraneVectorEnv(crane_env.CraneVectorEnv):
             spring = spec.actuator(f"{joint.name}_integral")
             spring.delay = DEAD_TIME[action]
             longest = DEAD_TIME[action] + DRAWN["extra_delay"][2]
-            spring.nsample = int(longest / spec.option.timestep) + 2  # commands that it remembers
+            spring.nsample = int(longest / 1e-3) + 2  # for physics steps of 1 ms or more
             spring.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             spring.forcerange = joint.actfrcrange
         return spec

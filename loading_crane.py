@@ -4,7 +4,7 @@ Starts and rules are those of crane_env.py; easy tasks also start on the way. Wi
 must lie in the bunk, between the stakes, within 15 degrees of the truck's axis, slower than 0.05
 m/s, with open jaws off it, throughout 0.5 s. This ends the episode as "loaded". A log not lifted
 within 12 s, or lost later, ends it, too. A load is gentle if the crane never pressed on ground or
-truck with more than 20 kN, and the log never met the bed faster than 1 m/s, 20 kN in `ground_peak`.
+truck with more than 20 kN, and the log met the bed at 1 m/s or less (`ground_peak`: as 20 kN).
 
 Five numbers follow the 18 of crane_env.py, before the hydraulic crane's sensors. On the machine
 joint sensors and a camera would give them. They have the errors of `randomize`, no `pose_noise`.
@@ -46,7 +46,7 @@ GRIP_TOP = 0.43  # m from p_C up to the log's upper side: it touches the frame o
 
 # ---- the reward; a later stage adds to what all earlier ones pay; weights: docs/learned.md
 CARRY_HEIGHT = STAKE_TOP + 0.15  # m, of the log's lowest point, to pass the stakes
-LIFTED_PAY = 6.0  # most that r_distance, r_grapple and r_lift pay together
+LIFTED_PAY = 1 + crane_env.GRAPPLE_WEIGHT + crane_env.LIFT_WEIGHT + crane_env.CARRY_WEIGHT  # most
 HEIGHT_WEIGHT = 2.0  # as much as r_lift pays for the first metre
 SWING_WEIGHT = 3.0  # more than for the height: the way to the bunk takes longer
 SWING_ANGLE, RADIUS_MISS = 2.2, 2.5  # rad away where r_swing is 0; m off its radius where 1/e
@@ -182,7 +182,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         }
 
     def rules(self, state: CraneState, info: dict[str, Array]) -> dict[str, Array]:
-        """not_lifted: after LIFT_TIME. log_lost: loose beside the bunk, low or for HOLD_TIME."""
+        """log_lost: let go outside the bunk, onto the ground or for HOLD_TIME. not_lifted: late."""
         (x, y, _), lowest = state.log_centre.T, info["clearance"]
         outside = (np.abs(y) > STAKE_Y) | (x < BUNK_X[0]) | (x > BUNK_X[1])
         dropped = ((self.loose > 0) & (lowest < SETTLED)) | (self.loose >= self.hold_steps)

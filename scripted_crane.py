@@ -88,7 +88,7 @@ class Settings:
     level: float = 0.03  # m off the closing height at most: higher tips only pinch a thin log
     aligned: float = 0.1  # rad off the log's yaw at most, to close the jaws
     clearance: float = 0.0  # m, of the tips above the ground when they close around a thin log
-    rise: float = 0.0  # m/rad, how much higher they are before; a thick log stops the jaws there
+    rise: float = 0.0  # m/rad, more clearance for each rad that q8 is still short of Q8_THIN
     jaw_speed: float = 1.0  # command of the closing jaws, a fraction of q8's limit
     meeting_speed: float = 1.0  # the same from slow_at to Q8_THIN, where they meet the log
     slow_at: float = 1.2  # rad, of q8
@@ -220,8 +220,8 @@ class ScriptedCrane:
         # Tips far under a thick log would pull soft drives down. Jaws meet a thick log early, so
         # the grapple starts high and sinks while they close.
         q8_then = q8 + settings.latency * q8_speed
-        thicker = np.clip(Q8_THIN - q8_then, 0.0, Q8_THIN - Q8_THICK)
-        clearance = settings.clearance + settings.rise * thicker
+        still_open = np.clip(Q8_THIN - q8_then, 0.0, Q8_THIN - Q8_THICK)
+        clearance = settings.clearance + settings.rise * still_open
         at_level = np.abs(delta_p[:, 2] + clearance) < settings.level
         near_by = (away < settings.near) & (np.abs(turn) < NEARLY_ALIGNED)
         in_place = (away < settings.over) & at_level & (np.abs(turn) < settings.aligned)

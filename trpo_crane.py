@@ -137,7 +137,7 @@ class Agent(nn.Module):
         mean = self.actor(obs)
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False)
 
-    def policy_parameters(self) -> list[nn.Parameter]:
+    def policy_parameters(self) -> list[nn.Parameter]:  # fisher_vector_product has this order
         return [*self.actor.parameters(), self.log_std]
 
     def to_env(self, actions: Tensor) -> np.ndarray:
@@ -164,7 +164,7 @@ def fisher_vector_product(agent: Agent, obs: Tensor, damping: float) -> Callable
     F = E[J^T J / sigma^2] for the weights of mu, with J = d mu / d weights, and 2 for each log
     sigma. Second derivatives of mu drop out because d KL / d mu is 0 at the old policy.
     """
-    mean, weights = agent.actor(obs), list(agent.actor.parameters())
+    mean, weights = agent.get_distribution(obs).mean, list(agent.actor.parameters())
     u = torch.zeros_like(mean, requires_grad=True)  # only to differentiate: J^T u is linear in u
     jt_u = flat(torch.autograd.grad(mean, weights, u, create_graph=True))
 

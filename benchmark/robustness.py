@@ -7,8 +7,8 @@
     python benchmark/robustness.py contacts   # results/contacts.csv: the paper's SDF contacts
     python benchmark/robustness.py changes --trials 1 --folder /tmp/test    # does it work?
 
-The policies are the shipped ones and the scripted crane. Rows of the task's present revision are
-not measured again: if a policy has changed, delete the file. `figures.py robustness` draws the
+The policies are the shipped ones and the scripted crane. Rows with the task's present revision
+are not measured again: if a policy has changed, delete the file. `figures.py robustness` draws the
 changes.
 """
 

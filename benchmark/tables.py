@@ -45,7 +45,7 @@ def evaluations(script: str, level: str, noise: str = "none", folder: str = "lev
 
 
 def numbers(rows: list[dict[str, str]], column: str) -> list[float]:
-    return [float(row[column] or "nan") for row in rows]
+    return [float("nan" if row[column] == "" else row[column]) for row in rows]
 
 
 def joined(values: Iterable[float], digits: int, missing: str = "never") -> str:

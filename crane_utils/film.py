@@ -127,8 +127,8 @@ def film(
 
 
 def window(
-    policy: Any, name: str, env_id: str, options: dict[str, Any], diameter: float = 0.5,
-    seed: int = 10_000, trial: int = 0, camera: str = "overview", deterministic: bool = True,
+    policy: Any, name: str, env_id: str, options: dict[str, Any], diameter: float,
+    seed: int, trial: int = 0, camera: str = "overview", deterministic: bool = True,
 ) -> None:  # fmt: skip
     """Show trials in real time until the window is closed. Keys: HELP.
 

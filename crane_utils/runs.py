@@ -66,7 +66,8 @@ def parse(arguments: type, description: str) -> tuple[Any, dict | None]:
         )
         fixed = ["env_id", "num_envs", "num_steps", "hidden_sizes", "lstm_size"]  # shapes
         fixed += ["env.offset", "env.signed_yaw", "env.axes", "env.sensors"]  # observations
-        for name in [*fixed, "log_std_init", "log_excess_init"]:  # the checkpoint has the width
+        fixed += ["log_std_init", "log_excess_init"]  # the checkpoint has the width
+        for name in fixed:
             if given.get(name) != (was := before.get(name)):
                 raise SystemExit(f"--resume: --{name.replace('_', '-')} must stay {was}")
         cranes, was = trials.crane_class(args.env_id), checkpoint["task"].get("revision")
@@ -126,7 +127,7 @@ def save(
     run["task"] = {"env_id": args.env_id, **getattr(crane, "task", {})}
     acting = {name: w for name, w in weights.items() if not name.startswith("critic.")}
     resuming = {"optimizer": optimizer.state_dict(), "iteration": iteration}
-    if (edited := folder / "script.unfinished").exists():  # its first weights, after --resume
+    if (edited := folder / "script.unfinished").exists():  # of --resume: the code of these weights
         os.replace(edited, folder / run["script"])
     write(folder / "policy.pt", run | {"weights": acting})
     write(folder / "checkpoint.pt", run | {"weights": weights} | resuming)

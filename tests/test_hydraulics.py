@@ -37,9 +37,18 @@ def test_a_step_of_the_command_is_answered_as_the_machine_answers(axis, step, wo
         assert np.abs(answer[at] - measured).max() < FIT[axis] + worse
 
 
-def test_nothing_moves_within_the_dead_time():
+@pytest.mark.parametrize("step", [0.005, 0.001])
+def test_nothing_moves_within_the_dead_time(step):
     """A telescope at rest waits for its load-holding valve, too."""
-    envs, moved = standing(0.8, 0.3, 0.5, 0.3, frame_skip=1), np.zeros(6)
+
+    class Edited(HydraulicCraneVectorEnv):
+        def make_spec(self):
+            spec = super().make_spec()
+            spec.option.timestep = step
+            return spec
+
+    envs = standing(0.8, 0.3, 0.5, 0.3, cranes=Edited, frame_skip=round(0.005 / step))
+    moved = np.zeros(6)
     before = envs.act[0].copy()
     for k in range(1, 45):
         hold(envs, np.full(6, 0.3), 1)

@@ -148,6 +148,13 @@ def test_a_released_log_is_loaded_and_gentle_if_it_did_not_fall(height, gentle):
     assert 0.5 < info["time"] < 1.5
 
 
+def test_a_load_pays_like_60_s_of_the_best_step():
+    stages = "HEIGHT SWING MIDDLE ALONG LOWER LET_GO RELEASE OFF".split()
+    names = ["LIFTED_PAY", *(f"{stage}_WEIGHT" for stage in stages)]
+    best = sum(getattr(loading_crane, name) for name in names)
+    assert loading_crane.LOADED_PAY == pytest.approx(60 * best)
+
+
 def test_a_fall_is_not_remembered_in_the_next_episode():
     envs = LoadingCraneVectorEnv(1, env_threads=1, autoreset=False)
     put(envs, -4.1, 0, 1.5)
