@@ -72,7 +72,6 @@ class ChangedCranes(HydraulicCraneVectorEnv):
             joint = spec.joints[index]
             drive = spec.actuator(f"{joint.name}_integral")
             drive.delay += self.delay
-            drive.nsample += int(self.delay / spec.option.timestep) + 1
         angle, g = np.radians(self.slope), spec.option.gravity[2]
         spec.option.gravity = [-g * np.sin(angle), 0, g * np.cos(angle)]
         if self.slope:
