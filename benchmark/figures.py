@@ -56,7 +56,7 @@ def draw(axis: plt.Axes, seeds: list[Curve], x: str, y: str, scale: float, **sty
     xs = scale * np.mean([np.interp(steps, run["steps"], run[x]) for run in seeds], axis=0)
     if y.endswith("_rate"):  # untrained policies hardly move: `eval_crane.py zero` lifts nothing
         xs, ys = np.append(0, xs), np.insert(ys, 0, 0, axis=1)
-    axis.plot(xs, ys.mean(0), **style)
+    axis.plot(xs, ys.mean(0), marker="." if len(xs) == 1 else "", **style)
     axis.fill_between(xs, ys.min(0), ys.max(0), color=style["color"], alpha=0.2)
 
 
@@ -73,7 +73,7 @@ def panels(columns: dict[str, tuple], rows: dict[str, str], path: Path) -> None:
             axis.grid(alpha=0.3)
             axes[row, 0].set_ylabel(f"{name} of the mean action")
         axis.set_xlabel(below)
-        axes[0, column].legend(fontsize=8, loc="lower right")
+        axes[0, column].legend(fontsize=8)
     save(figure, path)
 
 
@@ -95,6 +95,9 @@ def run(paths: Positional[tuple[Path, ...]], figure: Path = Path("curves.svg")) 
         lines.setdefault(label, []).append(runs.curve(rows))
         if not len(lines[label][-1]["steps"]):
             raise SystemExit(f"{path} has no evaluation on the crane yet (--eval-every)")
+    for label, seeds in lines.items():
+        ends = [100 * run["eval_success_rate"][-1] for run in seeds]
+        print(f"{label}: {tables.with_range(np.mean(ends), ends)} % at the end, {len(ends)} runs")
     columns = {"steps [million]": (lines, "steps", 1e-6), "minutes": (lines, "minutes", 1)}
     rows = {"success": "eval_success_rate", "return": "eval_episodic_return"}
     panels(columns, rows, figure)

@@ -1,17 +1,19 @@
 """A training run: its arguments, its folder, stop signals, and the policy that it leaves behind.
 
-Nothing here learns. A run's folder has four files: TensorBoard's events, policy.pt to act with,
-checkpoint.pt to resume from, and a copy of the script that wrote them.
+Nothing here learns. A run's folder has TensorBoard's events, policy.pt to act with, checkpoint.pt
+to resume from, and copies of the script and of the file of the task's class.
 """
 
 import argparse
 import importlib.util
+import inspect
 import os
 import shutil
 import signal
 import sys
 import time
 from dataclasses import asdict, fields
+from importlib.metadata import version
 from pathlib import Path
 from secrets import token_hex
 from types import FrameType
@@ -104,8 +106,14 @@ def restore(
     return first_iteration, env_seed
 
 
+def task_file(env_id: str) -> Path | None:
+    """The file of the task's class, None if it is not the crane."""
+    cranes = trials.crane_class(env_id)
+    return Path(inspect.getfile(cranes)) if cranes else None
+
+
 def make_folder(args: Any) -> Path:
-    """The run's folder: that of --resume, or a new one with a copy of the script."""
+    """The run's folder: that of --resume, or a new one. Script and task are copied into it."""
     if args.resume:
         shutil.copy(sys.argv[0], args.resume / "script.unfinished")  # perhaps edited: see `save`
         return args.resume
@@ -114,6 +122,8 @@ def make_folder(args: Any) -> Path:
     folder = Path("runs", name.replace("/", "-").replace(":", "-"))
     folder.mkdir(parents=True)
     shutil.copy(sys.argv[0], folder)
+    if task := task_file(args.env_id):
+        shutil.copy(task, folder)
     print(f"writing to {folder}", flush=True)
     return folder
 
@@ -125,12 +135,14 @@ def save(
     weights, crane = agent.state_dict(), envs.unwrapped
     run = {"script": Path(sys.argv[0]).name, "args": asdict(args) | {"resume": None}}
     run["task"] = {"env_id": args.env_id, **getattr(crane, "task", {})}
+    run["versions"] = {package: version(package) for package in ("mujoco", "torch")}
+    run["iteration"] = iteration
     acting = {name: w for name, w in weights.items() if not name.startswith("critic.")}
-    resuming = {"optimizer": optimizer.state_dict(), "iteration": iteration}
     if (edited := folder / "script.unfinished").exists():  # of --resume: the code of these weights
         os.replace(edited, folder / run["script"])
     write(folder / "policy.pt", run | {"weights": acting})
-    write(folder / "checkpoint.pt", run | {"weights": weights} | resuming)
+    resuming = {"weights": weights, "optimizer": optimizer.state_dict()}
+    write(folder / "checkpoint.pt", run | resuming)
 
 
 def write(path: Path, contents: dict[str, Any]) -> None:
@@ -167,8 +179,10 @@ class StopSignal:
 def brief(numbers: dict[str, float]) -> str:
     """What the progress bar and the line of an evaluation say."""
     named = {name.rpartition("/")[2]: number for name, number in numbers.items()}
-    shown = ("success_rate", "gentle_rate", "episodic_return", "SPS")
-    return ", ".join(f"{name} {named[name]:.3g}" for name in shown if name in named)
+    rates = ("success_rate", "gentle_rate", "episodic_return")
+    shown = {name: f"{named[name]:.3g}" for name in rates if name in named}
+    shown |= {"SPS": f"{named['SPS']:,.0f}"} if "SPS" in named else {}
+    return ", ".join(f"{name} {number}" for name, number in shown.items())
 
 
 def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> None:
@@ -184,7 +198,8 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
     """The agent in a run's folder or policy.pt, its task, and the name of its script.
 
     The agent is built by the copy of the script beside policy.pt, which is code that runs, or by
-    the script of that name in this repository.
+    the script of that name in this repository. stderr says if the run is not finished, or if its
+    task's file has changed.
     """
     path = path / "policy.pt" if path.is_dir() else path
     if not path.is_file():
@@ -195,6 +210,14 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
         script = Path(__file__).parents[1] / saved["script"]
     if not script.is_file():
         raise SystemExit(f"{path} needs {saved['script']}, whose Agent it holds, beside it")
+    args, task = saved["args"], task_file(saved["task"]["env_id"])
+    if task and (copy := path.parent / task.name).is_file():
+        if copy.read_bytes() != task.read_bytes():
+            print(f"{task.name} has changed since the training of {path.parent}", file=sys.stderr)
+    batch_size, total = args["num_envs"] * args["num_steps"], args["total_timesteps"]
+    done = saved.get("iteration", total) * batch_size
+    if done + batch_size <= total:
+        print(f"{path.parent}: after {done:,} of {total:,} steps", file=sys.stderr)
     spec = importlib.util.spec_from_file_location(f"script_of_{path.parent.name}", script)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses look for it

@@ -316,6 +316,21 @@ def test_a_run_is_built_by_the_script_that_made_it(trained, tmp_path):
         runs.load_policy(other)
 
 
+def test_an_unfinished_run_and_a_changed_task_are_named(trained, tmp_path, capsys):
+    other = tmp_path / "run"
+    shutil.copytree(trained, other)
+    runs.load_policy(other)
+    assert not capsys.readouterr().err
+    saved = runs.load(other / "policy.pt")
+    saved["args"]["total_timesteps"] = 4_800
+    torch.save(saved, other / "policy.pt")
+    (other / "toy_tasks.py").write_text("# before", encoding="utf-8")
+    runs.load_policy(other)
+    changed, unfinished = capsys.readouterr().err.splitlines()
+    assert changed.startswith("toy_tasks.py has changed since the training of")
+    assert unfinished.endswith(": after 24 of 4,800 steps")
+
+
 def test_a_run_of_another_revision_is_not_resumed(trained, monkeypatch):
     monkeypatch.setattr(toy_tasks.Quick, "REVISION", 99)
     monkeypatch.setattr(sys, "argv", ["ppo_crane.py", "--resume", str(trained)])

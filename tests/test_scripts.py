@@ -121,7 +121,7 @@ def test_a_run_on_cranes(tmp_path, monkeypatch, script):
     # the folder
     (folder,) = (tmp_path / "runs").iterdir()
     assert re.fullmatch(rf"toy_tasks-Quick-v0__{script}__1__\d+_\w+", folder.name)
-    files = {"policy.pt", "checkpoint.pt", f"{script}.py"}
+    files = {"policy.pt", "checkpoint.pt", f"{script}.py", "toy_tasks.py"}
     assert {file.name for file in folder.iterdir()} == files
     assert (folder / f"{script}.py").read_bytes() == (ROOT / f"{script}.py").read_bytes()
     agent, task, name = runs.load_policy(folder)
@@ -334,6 +334,7 @@ def test_two_runs_never_share_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(time, "time", lambda: 1.7e9)
     monkeypatch.setattr(os, "getpid", lambda: 7)
+    monkeypatch.setattr(runs, "task_file", lambda env_id: None)
     monkeypatch.setattr(sys, "argv", [str(ROOT / "ppo_crane.py")])
     args = SimpleNamespace(env_id="my/task:Crane-v0", exp_name="a:b/c", seed=3, resume=None)
     folders = {runs.make_folder(args) for _ in range(2)}
