@@ -66,9 +66,10 @@ HARD = {
     for level, flags in (("hydraulic", HYDRAULIC), ("randomized", RANDOMIZED))
 }
 HARD["hydraulic"][MPPO] += "--learning-rate 1e-3"
-HARD["randomized"][MPPO] = f"--env-id {LEVELS['randomized']} --total-timesteps 7372800 "
-HARD["randomized"][MPPO] += "--num-envs 256 --curriculum 0.2 --learning-rate 7e-4 "
-HARD["randomized"][MPPO] += "--minibatch-size 2048"
+LARGE = f"--env-id {LEVELS['randomized']} --total-timesteps 7372800 --num-envs 256 "
+LARGE += "--curriculum 0.2 --learning-rate 7e-4 "
+HARD["randomized"][MPPO] = LARGE + "--minibatch-size 2048"
+HARD["randomized"][RECURRENT] = LARGE + "--num-minibatches 8"
 CYCLE = "--total-timesteps 8192000 --num-envs 128 --curriculum 0.3 --horizon-growth 1.5 "
 CYCLE += "--reward-scale 0.02 --ent-coef 0.003 --eval-every 100 "
 CYCLES = {  # mPPO loads on both levels
