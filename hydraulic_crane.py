@@ -47,11 +47,11 @@ OIL = np.array(
 )  # fmt: skip
 FULL_TELESCOPE = 3.849e-3  # m^3/m of the telescope's way out under a load too heavy for that
 SERVOS_OF_ACTION = np.bincount(ACTION_OF_SERVO)  # how many share the force of the oil
-FIRST_SERVO = [ACTION_OF_SERVO.index(k) for k in range(6)]  # first stage, outer jaw
+FIRST_SERVO = [ACTION_OF_SERVO.index(k) for k in range(6)]  # of each command: stage 1, outer jaw
 PASSIVE = [4, 5]  # of our q1 ... q8
 
 # What randomize=1 draws at each start: nominal, lowest and highest value. Bands of stiffness and
-# damping are wide: their logarithms are uniform. All else is uniform. joint_error: rad, q4: none.
+# damping are wide: their logarithms are uniform. All else is uniform. joint_error: rad, not of q4.
 DRAWN = {
     "stiffness": (STIFFNESS, [2.01e5, 1.28e6, 2.89e5, 1.05e5, 2.55e3, 1.25e4],
                   [3.99e5, 2.75e6, 1.73e6, 2.63e6, 1.24e4, 5.0e4]),

@@ -97,7 +97,7 @@ def run(paths: Positional[tuple[Path, ...]], figure: Path = Path("curves.svg")) 
             raise SystemExit(f"{path} has no evaluation on the crane yet (--eval-every)")
     for label, seeds in lines.items():
         ends = [100 * run["eval_success_rate"][-1] for run in seeds]
-        print(f"{label}: {tables.with_range(np.mean(ends), ends)} % at the end, {len(ends)} runs")
+        print(f"{label}: last success {tables.with_range(np.mean(ends), ends)} %")
     columns = {"steps [million]": (lines, "steps", 1e-6), "minutes": (lines, "minutes", 1)}
     rows = {"success": "eval_success_rate", "return": "eval_episodic_return"}
     panels(columns, rows, figure)

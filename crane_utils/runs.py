@@ -115,16 +115,17 @@ def task_file(env_id: str) -> Path | None:
 def make_folder(args: Any) -> Path:
     """The run's folder: that of --resume, or a new one. Script and task are copied into it."""
     if args.resume:
-        shutil.copy(sys.argv[0], args.resume / "script.unfinished")  # perhaps edited: see `save`
-        return args.resume
-    # two runs that start together, also in containers, get two folders
-    name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{token_hex(2)}"
-    folder = Path("runs", name.replace("/", "-").replace(":", "-"))
-    folder.mkdir(parents=True)
-    shutil.copy(sys.argv[0], folder)
+        folder = args.resume
+        shutil.copy(sys.argv[0], folder / "script.unfinished")  # perhaps edited: see `save`
+    else:
+        # two runs that start together, also in containers, get two folders
+        name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}_{token_hex(2)}"
+        folder = Path("runs", name.replace("/", "-").replace(":", "-"))
+        folder.mkdir(parents=True)
+        shutil.copy(sys.argv[0], folder)
+        print(f"writing to {folder}", flush=True)
     if task := task_file(args.env_id):
         shutil.copy(task, folder)
-    print(f"writing to {folder}", flush=True)
     return folder
 
 
@@ -179,10 +180,8 @@ class StopSignal:
 def brief(numbers: dict[str, float]) -> str:
     """What the progress bar and the line of an evaluation say."""
     named = {name.rpartition("/")[2]: number for name, number in numbers.items()}
-    rates = ("success_rate", "gentle_rate", "episodic_return")
-    shown = {name: f"{named[name]:.3g}" for name in rates if name in named}
-    shown |= {"SPS": f"{named['SPS']:,.0f}"} if "SPS" in named else {}
-    return ", ".join(f"{name} {number}" for name, number in shown.items())
+    shown = {"success_rate": ".3g", "gentle_rate": ".3g", "episodic_return": ".3g", "SPS": ",.0f"}
+    return ", ".join(f"{name} {named[name]:{how}}" for name, how in shown.items() if name in named)
 
 
 def check_finite(iteration: int, stats: dict[str, float], agent: nn.Module) -> None:
@@ -210,13 +209,13 @@ def load_policy(path: Path) -> tuple[nn.Module, dict[str, Any], str]:
         script = Path(__file__).parents[1] / saved["script"]
     if not script.is_file():
         raise SystemExit(f"{path} needs {saved['script']}, whose Agent it holds, beside it")
-    args, task = saved["args"], task_file(saved["task"]["env_id"])
-    if task and (copy := path.parent / task.name).is_file():
-        if copy.read_bytes() != task.read_bytes():
-            print(f"{task.name} has changed since the training of {path.parent}", file=sys.stderr)
+    task, args = task_file(saved["task"]["env_id"]), saved["args"]
+    copy = path.parent / task.name if task else path
+    if task and copy.is_file() and copy.read_bytes() != task.read_bytes():
+        print(f"{task.name} has changed since the training of {path.parent}", file=sys.stderr)
     batch_size, total = args["num_envs"] * args["num_steps"], args["total_timesteps"]
-    done = saved.get("iteration", total) * batch_size
-    if done + batch_size <= total:
+    done = saved.get("iteration", 0) * batch_size
+    if 0 < done <= total - batch_size:
         print(f"{path.parent}: after {done:,} of {total:,} steps", file=sys.stderr)
     spec = importlib.util.spec_from_file_location(f"script_of_{path.parent.name}", script)
     module = importlib.util.module_from_spec(spec)

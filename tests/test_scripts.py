@@ -343,6 +343,13 @@ def test_two_runs_never_share_a_folder(tmp_path, monkeypatch):
     assert not any(set(":/") & set(folder.name) for folder in folders)
 
 
+def test_a_resumed_run_keeps_the_task_that_it_goes_on_with(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(ROOT / "ppo_crane.py")])
+    (tmp_path / "toy_tasks.py").write_text("# before", encoding="utf-8")
+    runs.make_folder(SimpleNamespace(env_id="toy_tasks:Quick-v0", resume=tmp_path))
+    assert (tmp_path / "toy_tasks.py").read_bytes() == (ROOT / "tests/toy_tasks.py").read_bytes()
+
+
 # ---- arguments and tasks
 
 
