@@ -488,7 +488,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         return values
 
     def reset(self, *, seed: int | Sequence | None = None, options=None) -> tuple[Array, dict]:
-        """New episodes of all cranes or of options["reset_mask"] (N,). All get the seeds."""
+        """New episodes of all cranes or of options["reset_mask"] (N,). Seeds go to all cranes."""
         if seed is not None or self.rngs is None:
             if np.ndim(seed) == 0:  # one, or None: crane i draws from its i-th child
                 seed = SeedSequence(seed).spawn(self.num_envs)
