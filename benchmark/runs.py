@@ -67,9 +67,9 @@ HARD = {
 }
 HARD["hydraulic"][MPPO] += "--learning-rate 1e-3"
 LARGE = f"--env-id {LEVELS['randomized']} --total-timesteps 7372800 --num-envs 256 "
-LARGE += "--curriculum 0.2 --learning-rate 7e-4 "
-HARD["randomized"][MPPO] = LARGE + "--minibatch-size 2048"
-HARD["randomized"][RECURRENT] = LARGE + "--num-minibatches 8"
+LARGE += "--curriculum 0.2 "
+HARD["randomized"][MPPO] = LARGE + "--minibatch-size 2048 --learning-rate 7e-4"
+HARD["randomized"][RECURRENT] = LARGE + "--num-minibatches 8 --log-std-init -1.6 --narrowing 1.5"
 CYCLE = "--total-timesteps 8192000 --num-envs 128 --curriculum 0.3 --horizon-growth 1.5 "
 CYCLE += "--reward-scale 0.02 --ent-coef 0.003 --eval-every 100 "
 CYCLES = {  # mPPO loads on both levels
