@@ -189,10 +189,9 @@ class CraneState(NamedTuple):
 def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
     """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
 
-    Paper: Eqs. (relative distance) and (angle distance). offset "plus" adds d_off = (d_max - d) / 2
-    of the log's diameter d, "minus" subtracts it. The signed angle turns the grapple's axis into
-    the log's. A log looks the same after half a turn, so this is the shorter turn, or the longer
-    one where the shorter would take the rotator beyond ROTATOR_MAX.
+    Eqs. (4) and (8). offset "plus" adds d_off = (d_max - d) / 2 of the log's diameter d, "minus"
+    subtracts it. The signed angle turns the grapple's axis into the log's. A log has no front: this
+    is the shorter turn, or the longer where the shorter takes the rotator beyond ROTATOR_MAX.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
@@ -341,7 +340,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         width: int = 640,
         height: int = 480,
         decorate: Callable[[mujoco.MjSpec], None] | None = None,  # adds what is only seen
-        autoreset: bool = True,  # False: the caller resets, whatever `metadata` says
+        autoreset: bool = True,  # False: the caller resets
         **options: Any,  # `Options`
     ):
         self.options = self.Options(**options)
@@ -372,7 +371,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         model.actuator_biasprm[:8, 2] /= self.coarse
         self.max_steps = int(np.ceil(self.TIME_LIMIT / self.dt - 1e-9))
         self.hold_steps = int(np.floor(self.HOLD_TIME / self.dt + 1e-9)) + 1  # both ends count
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.dt))}
+        fps, mode = max(1, round(1 / self.dt)), "SameStep" if autoreset else "Disabled"
+        self.metadata = self.metadata | {"render_fps": fps, "autoreset_mode": AutoresetMode(mode)}
 
         self.batch = batch = Batch(model, num_envs, env_threads, persistent=True)
         # live views of the engine's arrays, one row a crane. Each has a log of its own
@@ -545,8 +545,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         else:
             self.starts[i] = *sample_start(start_rng), {}  # {}: what a subclass draws with it
         start = tuple(np.copy(part) for part in self.starts[i][:3])  # hooks may change it in place
-        difficulty = self.difficulty / self.FULL_STARTS
-        return ease_start(*start, difficulty) if difficulty < 1 else start
+        full = self.difficulty >= self.FULL_STARTS
+        return start if full else ease_start(*start, self.difficulty / self.FULL_STARTS)
 
     def place(self, ids: Array, q: Array, log_pose: Array, diameter: Array) -> None:
         """Start episodes at rest in cranes `ids`: q (n, 8), log (x, y, yaw) (n, 3), m and rad."""

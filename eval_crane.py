@@ -68,7 +68,7 @@ class Args:
     diameters: tuple[Annotated[float, Field(ge=D_MIN, le=D_MAX)], ...] = DIAMETERS
     """log diameters [m]"""
     seed: Annotated[int, Field(ge=0)] = EVAL_SEED
-    """seed of the trials; reported scores have seed 60000 (docs/compare.md)"""
+    """seed of the trials; the leaderboard has 60000 (docs/compare.md)"""
     stochastic: bool = False
     """sample actions instead of taking the mean action"""
     threads: Annotated[int, Field(ge=0)] = 0

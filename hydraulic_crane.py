@@ -16,7 +16,7 @@ With `sensors` the observation has 32 numbers, what the machine measures:
 | 0-17   | those of crane_env.py                                          |       |           |
 | 18-23  | last command of q1, q2, q3, q4, q7, q8, fraction of its limit  | 1     | -1, 1     |
 | 24-25  | velocities of q5, q6                                           | rad/s | -10, 10   |
-| 26-31  | force of the oil on q1, q2, q3, q4, q7, q8, fraction of limit  | 1     | -1, 1     |
+| 26-31  | force of the oil on the same, fraction of its actuatorfrcrange | 1     | -1, 1     |
 """
 
 from typing import Annotated, Any

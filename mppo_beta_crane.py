@@ -4,7 +4,7 @@ The paper's own algorithm (Vu et al., Sec. IV-C). It differs from PPO in two poi
 
 - The policy is a_n ~ Beta(alpha(s), beta(s)) with alpha, beta > 1, and a = low + (high - low) a_n:
   no action is outside the limits (Chou et al., 2017). An evaluation takes the mean of the Beta.
-- In training each sampled action is perturbed, Eq. (robust ppo): with g ~ U(-eps, eps)
+- In training each sampled action is perturbed, Eq. (20): with g ~ U(-eps, eps)
   a_n <- clip(a_n + g, A_MIN, 1 - A_MIN). Here eps falls to 0 in the first part of the run.
 
 The rest is PPO with generalized advantage estimation (Schulman et al., 2016, 2017):
@@ -227,7 +227,7 @@ if __name__ == "__main__":
                 agent.update_normalizer(next_obs)
                 obs[step] = agent.normalize(next_obs)
                 action = agent.get_distribution(obs[step]).sample()
-            noise = epsilon * torch.empty_like(action).uniform_(-1, 1)  # Eq. (robust ppo)
+            noise = epsilon * torch.empty_like(action).uniform_(-1, 1)  # Eq. (20)
             actions[step] = (action + noise).clamp(A_MIN, 1 - A_MIN)
             next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
             next_obs = to_tensor(next_obs, torch.float64)

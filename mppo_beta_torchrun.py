@@ -238,7 +238,7 @@ if __name__ == "__main__":
                 raw_obs.append(next_obs)
                 obs[step] = agent.normalize(next_obs)
                 action = agent.get_distribution(obs[step]).sample()
-            noise = epsilon * torch.empty_like(action).uniform_(-1, 1)  # Eq. (robust ppo)
+            noise = epsilon * torch.empty_like(action).uniform_(-1, 1)  # Eq. (20)
             actions[step] = (action + noise).clamp(A_MIN, 1 - A_MIN)
             next_obs, reward, terminated, truncated, info = envs.step(agent.to_env(actions[step]))
             next_obs = to_tensor(next_obs, torch.float64)

@@ -1,6 +1,6 @@
 """PPO: proximal policy optimization with a Gaussian policy, on the crane.
 
-The paper's first baseline (Vu et al., Sec. V-A), after Schulman et al., 2017:
+A baseline of the paper (Vu et al., Sec. V-A), after Schulman et al., 2017:
 
 - The policy is a ~ N(mu(s), sigma^2), with one sigma per action for all states. An action is
   clipped to the environment's limits only when it is executed. An evaluation takes the mean mu(s).

@@ -1,6 +1,6 @@
 """Recurrent PPO: proximal policy optimization with an LSTM as memory, on the crane.
 
-The paper's third baseline (Vu et al., Sec. V-A), after Schulman et al., 2017, and Hochreiter and
+A baseline of the paper (Vu et al., Sec. V-A), after Schulman et al., 2017, and Hochreiter and
 Schmidhuber, 1997. One observation of ForestryCrane-v0 tells neither the log's diameter nor how fast
 the grapple swings. A policy with a memory can infer both:
 

@@ -1,6 +1,6 @@
 """TRPO: trust region policy optimization with a Gaussian policy, on the crane.
 
-The paper's second baseline (Vu et al., Sec. V-A), after Schulman et al., 2015:
+A baseline of the paper (Vu et al., Sec. V-A), after Schulman et al., 2015:
 
 - The policy is a ~ N(mu(s), sigma^2) as in PPO. An evaluation takes the mean mu(s).
 - Each rollout gives one step p of the policy along the natural gradient. Its length keeps the mean

@@ -62,7 +62,7 @@ class LoadingSettings(Settings):
     release: float = 0.06  # m, of the jaws above the bed, to open
     touch: float = 0.02  # m, of the log above the bed, to open
     calm: float = 0.3  # m/s at which it swings at most, to open
-    release_speed: float = 0.12  # of opening jaws until FREE_Q8, of q8's limit; 0.2 drops logs
+    release_speed: float = 0.12  # of opening jaws until FREE_Q8; with 0.2 ideal servos drop logs
     q8_release: float = 0.9  # rad; the tips are 1.73 m apart then, and the stakes 2.3 m
 
 

@@ -97,13 +97,15 @@ def test_a_crane_is_the_same_for_any_number_of_cranes_and_threads():
 
 
 def test_some_cranes_can_be_reset():
+    """Also below Gymnasium's wrappers, which read in `metadata` who resets."""
     envs = CraneVectorEnv(3, autoreset=False)
+    envs = gymnasium.wrappers.vector.TransformObservation(envs, lambda obs: 2 * obs)
     envs.reset(seed=0)
     for _ in range(5):
         before, *_ = envs.step(np.ones((3, 6)))
     mask = np.array([True, False, False])
     after, _ = envs.reset(options={"reset_mask": mask})
-    np.testing.assert_array_equal(envs.steps, [0, 5, 5])
+    np.testing.assert_array_equal(envs.unwrapped.steps, [0, 5, 5])
     np.testing.assert_array_equal((after != before).any(axis=1), mask)
 
 
