@@ -214,7 +214,7 @@ class LoadingCraneVectorEnv(crane_env.CraneVectorEnv):
         opened = np.clip((Q8_MAX - state.q[:, 7]) / (Q8_MAX - OPEN_Q8), 0, 1)
         off = (opened == 1) & (self.on_log == 0)
         squeeze = self.servo_kp[:, 6:] * (self.act[:, 6:] - self.qpos[:, 8:10])  # N m
-        squeeze = (squeeze / self.force_limit[1, :, 6:]).mean(axis=-1)  # 1.2 at most
+        squeeze = (squeeze / self.force_limit[1, :, 6:]).mean(axis=-1)  # up to 1.2 (measured)
         told = -self.command[:, 5] / crane_env.SPEED_LIMITS[1, 5]  # noise moves it at any squeeze
         lets_go = np.where(opened == 1, 1.0, (2 - squeeze + told) / 4)
         gentle = 1 + GENTLE_BONUS * GENTLE_FORCE / np.maximum(self.ground_peak, GENTLE_FORCE)
