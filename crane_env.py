@@ -444,7 +444,6 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         missing = first({name: n < self.hold_steps for name, n in self.streaks.items()}, "")
         info["safe"] = missing == ""
 
-        # rules
         rules = self.checked(self.rules(state, info))
         ending = first(rules | {"time_limit": time > self.TIME_LIMIT - 1e-9}, "none")
         done, truncated = ending != "none", ending == "time_limit"
@@ -467,7 +466,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
             self.recent_success[i].append(bool(success[i]))
             if not success[i]:
                 self.failures[i].append(self.starts[i])
-        info |= {f"_{key}": done | (key not in ends) for key in info}
+        always = np.ones_like(done)
+        info |= {f"_{key}": done if key in ends else always for key in info}
         if self.autoreset and done.any():
             info["final_info"] = info.copy()
             info["final_obs"] = np.full(self.num_envs, None, dtype=object)
