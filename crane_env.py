@@ -8,6 +8,7 @@ stages). Two passive joints q5 and q6 let the grapple hang: a rotator q7 with tw
 lies somewhere in front of the crane. Within 6 s the grapple must reach it. At the end of the 9 s
 the log must hang in the jaws. Sections and equations are those of Vu et al. (README.md).
 assets/README.md has the source of every number, docs/environment.md the task on one page.
+A task of your own overrides hooks of `CraneVectorEnv`: loading_crane.py, docs/tutorial.md.
 
 Observation, float32, `Box` of shape (18,):
 
@@ -36,8 +37,6 @@ that direction. 0 stops the joint. Values outside the box are clipped.
 | 3     | q4 each stage          | -1, 1     | -0.630, 0.400 m/s     |
 | 4     | q7 rotator             | -1, 1     | -2.12, 2.12 rad/s     |
 | 5     | q8 jaws, + closes      | -1, 1     | -1.8, 1.8 rad/s       |
-
-A task of your own overrides hooks of `CraneVectorEnv`: loading_crane.py, docs/tutorial.md.
 """
 
 import os
@@ -154,10 +153,8 @@ def sample_start(rng: Generator) -> tuple[Array, Array, float]:
 def ease_start(
     q: Array, log_pose: Array, diameter: float, difficulty: float
 ) -> tuple[Array, Array, float]:
-    """A start of `sample_start` with its log moved towards an easy place, which difficulty 0 has.
-
-    The easy place is under the boom's tip, or as near to it as logs may lie. It has the grapple's
-    yaw and the mean diameter.
+    """A start of `sample_start`, its log moved towards an easy place, which difficulty 0 has: under
+    the boom's tip, or as near to it as logs may lie, with the grapple's yaw and the mean diameter.
     """
     q1, q7, (x, y, yaw) = q[0], q[6], log_pose
     out, _ = tip_position(*q[1:4])
@@ -186,27 +183,35 @@ class CraneState(NamedTuple):
     carried: Array  # (N,) 1 - (force of log and crane on the ground) / (log's weight); 1 at a start
 
 
-def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array, Array]:
-    """Delta_p (N, 3) in m, Delta_psi (N,) in [0, 1], its signed angle (N,) in rad.
-
-    Eqs. (4) and (8). offset "plus" adds d_off = (d_max - d) / 2 of the log's diameter d, "minus"
-    subtracts it. The signed angle turns the grapple's axis into the log's. A log has no front: this
-    is the shorter turn, or the longer where the shorter takes the rotator beyond ROTATOR_MAX.
+def relative_pose(state: CraneState, offset: str = "plus") -> tuple[Array, Array]:
+    """Delta_p (N, 3) in m and Delta_psi (N,) in [0, 1], Eqs. (4) and (8). offset "plus" adds
+    d_off = (d_max - d) / 2 of the log's diameter d, "minus" subtracts it.
     """
     delta_p = state.log_centre - state.grapple_centre
     delta_p[:, 2] += (1.0 if offset == "plus" else -1.0) * (D_MAX - state.diameter) / 2
+    cos, _ = turn_seen_from_above(state)
+    return delta_p, 1.0 - np.minimum(np.abs(cos), 1.0)
+
+
+def turn_seen_from_above(state: CraneState) -> tuple[Array, Array]:
+    """Cosine and sine of the angle from the grapple's axis to the log's, (N,) each."""
     (grapple_x, grapple_y, _), (log_x, log_y, _) = state.grapple_axis.T, state.log_axis.T
     shadow = np.maximum(np.sqrt(log_x**2 + log_y**2), 1e-9)  # its length on the ground
     log_x, log_y = log_x / shadow, log_y / shadow
-    dot = grapple_x * log_x + grapple_y * log_y
-    cross = grapple_x * log_y - grapple_y * log_x
-    signed_angle = (np.arctan2(cross, dot) + np.pi / 2) % np.pi - np.pi / 2
+    return grapple_x * log_x + grapple_y * log_y, grapple_x * log_y - grapple_y * log_x
+
+
+def signed_angle(state: CraneState) -> Array:
+    """The turn of the grapple's axis to the log's, (N,) in rad. A log has no front: this is the
+    shorter turn, or the longer where the shorter takes the rotator beyond ROTATOR_MAX.
+    """
+    cos, sin = turn_seen_from_above(state)
+    angle = (np.arctan2(sin, cos) + np.pi / 2) % np.pi - np.pi / 2
     slew = np.arctan2(state.log_centre[:, 1], state.log_centre[:, 0]) - state.q[:, 0]
     slew = (slew + np.pi) % (2 * np.pi) - np.pi
     # q7 once the crane faces the log and the grapple is aligned; a hanging grapple's yaw is q1 - q7
-    rotator = state.q[:, 6] + slew - signed_angle
-    signed_angle += np.pi * np.sign(rotator) * (np.abs(rotator) > ROTATOR_MAX)
-    return delta_p, 1.0 - np.minimum(np.abs(dot), 1.0), signed_angle
+    rotator = state.q[:, 6] + slew - angle
+    return angle + np.pi * np.sign(rotator) * (np.abs(rotator) > ROTATOR_MAX)
 
 
 def noisy_pose(delta_p: Array, angle: Array, epsilon: Array) -> tuple[Array, Array]:
@@ -294,8 +299,8 @@ def first(tests: dict[str, Array], otherwise: str) -> Array:
 class CraneVectorEnv(gymnasium.vector.VectorEnv):
     """N cranes stepped together on one `mujoco.batch.Batch`.
 
-    Crane i's starts depend on the seed, on i and, with retry, on how its episodes ended. They do
-    not depend on N (but easy ones of loading_crane.py do) or on the threads.
+    Crane i's starts depend on the seed, on i and, with retry, on how its episodes ended, but not on
+    the threads or on N (except easy ones of loading_crane.py).
 
     `info` describes the step just made, for every crane, also one whose episode just ended: the
     reward's terms, `time` (s), `d_combine`, `clearance`, `centre_miss`, `diameter` (m), `log_mass`
@@ -304,12 +309,12 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
     `termination`: the rule that ended the episode, "time_limit" or "none". At an end there are
     `success` (for Stable-Baselines3 `is_success`), `gentle` (success with at most GENTLE_FORCE on
     the ground) and `failure`: the rule or the first of `conditions` that failed. The mask `_key`
-    says for which cranes `key` is meaningful. `final_obs` and `final_info` hold the end of an
-    episode, because the observation is that of the next start (SAME_STEP autoreset).
+    says where `key` means something. After an end `obs` is the next start's, `final_obs` and
+    `final_info` are the end's (SAME_STEP autoreset).
 
-    `difficulty` in [0, 1] eases the starts and makes hits cheaper (1 is the full task), `retry` in
-    [0, 1] is the largest share of episodes that repeat a failed start. Both may be set at any time.
-    `observers` are called as observer(envs) after each physics step.
+    `difficulty` eases starts and hits, 1 is the full task. `retry` is the largest share of episodes
+    that repeat a failed start. Both, in [0, 1], may be set at any time. Each of `observers` is
+    called as observer(envs) after each physics step.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -381,8 +386,9 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         self.log_radius = sizes[:, model.geom("log").id, 0]
         self.qpos, self.qvel, self.ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         self.act, self.qfrc_bias = batch.bind("act")[:, :8], batch.bind("qfrc_bias")
-        self.sensordata = batch.bind("sensordata")
+        self.sensordata, self.warnings = batch.bind("sensordata"), batch.warning[:, :, 1]  # counts
         self.ground_force = self.history("ground_force")
+        self.gravity = np.linalg.norm(model.opt.gravity)  # m/s^2
         self.joint_range = model.jnt_range[JOINTS]  # (8, 2), rad and m
         self.servo_kp = np.tile(model.actuator_gainprm[INTEGRATORS, 0], (num_envs, 1))
         # N m and N, lowest and highest that each servo may push with, (2, N, 8)
@@ -571,12 +577,11 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def set_constants(self, ids: Array, radius: Array) -> None:
         """Write to the engine what differs between episodes: radius (n,) in m, your own bodies."""
-        mass = self.density[ids] * np.pi * radius**2 * LOG_LENGTH
+        mass = self.log_mass[ids] = self.density[ids] * np.pi * radius**2 * LOG_LENGTH
         across, along = mass * (3 * radius**2 + LOG_LENGTH**2) / 12, mass * radius**2 / 2
         capsule = self.batch.geom("log_capsule")
         self.log_radius[ids] = capsule.size[ids, 0] = radius
         capsule.size[ids, 1] = LOG_LENGTH / 2 - radius
-        self.log_mass[ids] = mass
         self.batch.body("log").inertia[ids] = np.stack([across, across, along], axis=-1)
 
     # ---- hooks: what moves the joints
@@ -607,33 +612,28 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
                 for observer in self.observers:
                     observer(self)
             ground = np.linalg.norm(self.ground_force.reshape(self.num_envs, -1, 3), axis=-1)
-            ground[self.warned()] = 0.0  # the engine has reset them
+            warned = self.warnings.any(axis=-1)
+            ground[warned] = 0.0  # the engine has reset them
             self.impact = np.maximum(self.impact, self.coarse**self.COARSE_HITS * ground.max(-1))
             self.ground_peak = np.maximum(self.ground_peak, self.impact)
         finite = np.isfinite(self.qpos).all(axis=-1) & np.isfinite(self.qvel).all(axis=-1)
-        return failed | self.warned() | ~finite
-
-    def warned(self) -> Array:
-        """Which cranes the engine has warned of since their start, (N,) bool."""
-        return self.batch.warning[:, :, 1].any(axis=-1)  # 1: how often each warning came
+        return failed | warned | ~finite
 
     def drive(self, ids: Array, seconds: float) -> None:
         """Set `ctrl` of cranes `ids`, in which a piece begins, for the next seconds."""
         # of all cranes: ideal servos and their integrators answer at every step
-        self.ctrl[:, :16] = np.tile(self.command[:, ACTION_OF_SERVO], 2)
+        self.ctrl[:, :8] = self.ctrl[:, INTEGRATORS] = self.command[:, ACTION_OF_SERVO]
 
     # ---- hooks: what is observed and measured, what ends an episode, the reward
 
     def state(self) -> CraneState:
         """A copy of the state of all cranes."""
         q, dq = self.qpos[:, JOINTS], self.qvel[:, JOINTS][:, ACTUATED]
-        # as in crane.xml; sensors of your own go behind the crane's force on the ground
-        parts = np.split(self.sensordata.copy(), [3, 6, 9, 12, 14, 17, 20], axis=1)
-        *poses, touch, log_support, crane_press, _ = parts
-        weight = np.linalg.norm(self.model.opt.gravity) * self.log_mass
-        ground = np.linalg.norm(log_support, axis=-1) + np.linalg.norm(crane_press, axis=-1)
-        carried = np.clip(1 - ground / weight, 0, 1)
-        return CraneState(q, dq, *poses, touch > 0, 2 * self.log_radius, carried)
+        sensors = self.sensordata.copy()  # as in crane.xml; sensors of your own go behind them
+        poses = [sensors[:, i : i + 3] for i in (0, 3, 6, 9)]
+        on_ground = [np.linalg.norm(sensors[:, i : i + 3], axis=-1) for i in (14, 17)]
+        carried = np.clip(1 - sum(on_ground) / (self.gravity * self.log_mass), 0, 1)
+        return CraneState(q, dq, *poses, sensors[:, 12:14] > 0, 2 * self.log_radius, carried)
 
     def bounded_observation(self, state: CraneState, diverged: Array | bool = False) -> Array:
         """`observe` as float32 (N, n): zeros for diverged cranes, all clipped to the space."""
@@ -651,8 +651,8 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def observe(self, state: CraneState) -> Array:
         """Observations (N, n). A subclass adds columns, and their limits to observation_limits."""
-        delta_p, delta_psi, signed_angle = relative_pose(state, self.options.offset)
-        angle = signed_angle if self.options.signed_yaw else delta_psi
+        delta_p, delta_psi = relative_pose(state, self.options.offset)
+        angle = signed_angle(state) if self.options.signed_yaw else delta_psi
         if self.options.pose_noise != "none":
             now = np.minimum(self.steps, self.noise.shape[1] - 1)
             delta_p, angle = noisy_pose(delta_p, angle, self.noise[np.arange(len(now)), now])
@@ -663,7 +663,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
 
     def measure(self, state: CraneState) -> dict[str, Array]:
         """What `info` says of all cranes."""
-        delta_p, delta_psi, _ = relative_pose(state, self.options.offset)
+        delta_p, delta_psi = relative_pose(state, self.options.offset)
         return {
             "d_combine": np.linalg.norm(delta_p, axis=-1) + delta_psi,
             "clearance": log_clearance(state),
@@ -702,7 +702,7 @@ class CraneVectorEnv(gymnasium.vector.VectorEnv):
         """Terms of the reward, their sum, (N,) each, by name. info has `termination`, too."""
         if self.options.reward == "paper":
             return paper_terms(state, info["d_combine"], self.command)
-        delta_p, delta_psi, _ = relative_pose(state, self.options.offset)
+        delta_p, delta_psi = relative_pose(state, self.options.offset)
         distance = np.linalg.norm(delta_p + [0, 0, CLOSING_HEIGHT], axis=-1) + delta_psi
         clearance, miss = info["clearance"], info["centre_miss"]
         grasp = self.grasp(state, miss)

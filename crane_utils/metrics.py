@@ -36,7 +36,7 @@ class Metrics:
         """Add what the last physics step took."""
         seconds = envs.model.opt.timestep
         q, dq = envs.qpos[:, JOINTS], envs.qvel[:, JOINTS][:, ACTUATED]
-        dq = dq * ~envs.warned()[:, None]  # the engine has reset those
+        dq = dq * ~envs.warnings.any(axis=-1, keepdims=True)  # the engine has reset those
         force = self.drive_force[:, SERVOS] @ np.eye(6)[ACTION_OF_SERVO]  # of both stages, jaws
         oil = oil_per_movement(cylinder_levers(q[:, 1], q[:, 2]), dq, force)
         flow = np.sum(oil * np.abs(dq), axis=-1)
