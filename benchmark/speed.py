@@ -1,7 +1,7 @@
 """Speed of simulator and training, beside bare MuJoCo, Gymnasium and Stable-Baselines3 (SB3).
 
     pip install -r benchmark/requirements.txt
-    python benchmark/speed.py    # half an hour; run nothing else
+    python benchmark/speed.py    # 40 minutes; run nothing else
 
 benchmark/results/throughput.csv gets the speeds, measured by turns, and their ratios. Cranes are
 driven by the shipped policy or the scripted crane, whose own time does not count. Trainings are
@@ -240,7 +240,7 @@ def cells() -> dict[tuple[str, int], Callable[[], list[float]]]:
     """What to measure, by name and frame skip."""
     policy, script = runs.load_policy(Path(SHIPPED))[0], ScriptedCrane()
     os.environ.pop("GOMP_SPINCOUNT", None)  # the script has set it; SB3 has torch's default
-    tenths, rollout = 90, 128 * CRANES
+    tenths, rollout = 450, 128 * CRANES  # five whole episodes
     found: dict = {("the paper's PPO", 1): lambda: [6500.0]}
     for skip in (20, 1):
         assert disagreement(policy, skip) < 1e-3, "PlainCrane is another task"
@@ -268,20 +268,20 @@ def main() -> None:
     measured, speeds = cells(), defaultdict(list)
     for key in (bar := tqdm([*measured] * 3, unit="cell")):
         bar.set_description(f"{key[0]}, skip {key[1]}")
-        speeds[key] += measured[key]()
+        speeds[key].append(np.median(measured[key]()))
     libraries = (mujoco, gymnasium, torch, stable_baselines3, sb3_contrib)
     versions = [f", {library.__name__} {library.__version__}" for library in libraries]
     machine = f"{os.cpu_count()} cores, {platform.platform()}{''.join(versions)}"
     rows: list[dict] = [{"part": "machine", "what": machine}]
-    for (what, skip), values in speeds.items():
-        row = {"part": "steps/s", "what": what, "skip": skip}
-        for name, of in (("median", np.median), ("min", min), ("max", max)):
-            row[name] = f"{of(values):.4g}"
-        rows.append(row)
+    values = {("steps/s", *key): of_rounds for key, of_rounds in speeds.items()}
     for skip, (name, ours, other) in product((20, 1), RATIOS):
-        if (other, skip) in speeds:
-            ratio = np.median(speeds[ours, skip]) / np.median(speeds[other, skip])
-            rows.append({"part": "ratio", "what": name, "skip": skip, "median": f"{ratio:.4g}"})
+        if (other, skip) in speeds:  # round by round: the machine may become slower or faster
+            values["ratio", name, skip] = np.array(speeds[ours, skip]) / speeds[other, skip]
+    for (part, what, skip), of_rounds in values.items():
+        row = {"part": part, "what": what, "skip": skip}
+        for name, of in (("median", np.median), ("min", min), ("max", max)):
+            row[name] = f"{of(of_rounds):.4g}"
+        rows.append(row)
     write_rows(RESULTS / "throughput.csv", rows)
 
 

@@ -222,11 +222,12 @@ def robustness() -> str:
 
 
 def speed() -> str:
-    """throughput.csv: the ratios, a column a frame skip."""
+    """throughput.csv: the ratios and their spread over the rounds, a column a frame skip."""
     ratios: dict[str, dict[str, str]] = defaultdict(dict)
     for row in read_rows(RESULTS / "throughput.csv"):
         if row["part"] == "ratio":
-            ratios[row["what"]][row["skip"]] = f"{float(row['median']):.2f}"
+            middle, low, high = (float(row[name]) for name in ("median", "min", "max"))
+            ratios[row["what"]][row["skip"]] = f"{middle:.2f} ({low:.2f}–{high:.2f})"
     lines = [[name, *[of.get(skip, "") for skip in ("20", "1")]] for name, of in ratios.items()]
     return table(["ratio", "skip 20", "skip 1"], lines)
 
