@@ -20,7 +20,7 @@
 # none of this.
 #
 # A new policy's noise changes at every step. In steps of 5 ms it jerks the ideal servos so hard that
-# `overspeed` ends nearly all first episodes, half of them within 0.05 s. No run has been finished.
+# `overspeed` ends nearly all first episodes, half of them within 0.05 s.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
